@@ -1,0 +1,1 @@
+"""Controllers that steer the rod to a goal shape, and the safety gate they pass."""

@@ -1,0 +1,15 @@
+"""Dual-arm shape control of deformable linear objects: cables, wires, hoses."""
+
+from gymnasium.envs.registration import register
+
+register(
+    id="dlo_gym/ShapeControl-v0",
+    entry_point="dlo_gym.envs.shape_env:ShapeControlEnv",
+    max_episode_steps=100,
+)
+register(
+    id="dlo_gym/ShapeControlTracked-v0",
+    entry_point="dlo_gym.envs.shape_env:ShapeControlEnv",
+    max_episode_steps=100,
+    kwargs={"observer": "tracking.observer:TrackerObserver"},
+)

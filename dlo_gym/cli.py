@@ -1,0 +1,51 @@
+"""The ``dlo`` command: one subcommand per job, imported only when asked for."""
+
+import sys
+from importlib import import_module
+from importlib.metadata import version
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from dlo_gym.exceptions import DloError
+
+# name: (where the function is, what it does); the function's own docstring is its --help.
+COMMANDS = {
+    "demo": ("control.demo:demo", "steer a cable to a goal shape by MPC on tracked images"),
+    "control": ("control.evaluate:control", "run a controller on an environment and report"),
+    "track": ("tracking.evaluate:track", "track the cable in a recording and report"),
+    "rollouts": ("dlo_gym.surrogate.rollouts:rollouts", "simulate rod rollouts for training"),
+    "train-surrogate": ("dlo_gym.surrogate.train:train_surrogate", "train the shape predictor"),
+    "train-rl": ("control.rl:train_rl", "train a policy with SAC and HER"),
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs one subcommand; returns the process's exit status."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    console = Console(stderr=True)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        table = Table("command", "what it does", title="dlo COMMAND [--help]", box=None)
+        for name, (_, summary) in COMMANDS.items():
+            table.add_row(name, summary)
+        Console().print(table)
+        return 0
+    name, *rest = arguments
+    if name == "--version":
+        print(version("dlo-gym"))
+        return 0
+    if name not in COMMANDS:
+        console.print(f"dlo: no command {name!r}; there are: {', '.join(COMMANDS)}", style="red")
+        return 2
+    module, function = COMMANDS[name][0].split(":")
+    try:
+        command = getattr(import_module(module), function)
+        tyro.cli(command, prog=f"dlo {name}", args=rest)
+    except (DloError, ValueError, FileExistsError, FileNotFoundError) as error:
+        console.print(f"dlo {name}: {error}", style="red", highlight=False, markup=False)
+        return 1
+    except KeyboardInterrupt:
+        console.print(f"dlo {name}: interrupted; what was finished is kept", style="yellow")
+        return 130
+    return 0

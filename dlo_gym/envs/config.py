@@ -1,0 +1,176 @@
+"""The options of a shape-control environment."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from dlo_gym.geometry.camera import CameraModel
+from dlo_gym.rod.properties import RodProperties
+
+OBSERVATION_MODES = ("state", "images")
+REWARDS = ("dense", "sparse")
+
+
+@dataclass(frozen=True)
+class ShapeEnvConfig:
+    """Every option that ``gym.make`` takes for a shape-control environment.
+
+    Attributes:
+        observer: ``"privileged"`` for the simulator's own state, or ``"module:Class"`` of an
+            ``Observer``.
+        observer_options: keyword arguments for that class.
+        observation_mode: ``"state"``, or ``"images"`` to add the cameras' images as keys.
+        properties: of the rod.
+        n_elements: of the rod; the centerline has one node more.
+        control_step: time between two actions [s].
+        max_translation_step: largest motion of a clamp along each world axis in one step [m].
+        max_rotation_step: largest rotation of a clamp about each of its axes in one step [rad].
+        axial_rotation: whether the action also turns the clamps about the rod's own axis.
+        reward: ``"dense"`` or ``"sparse"``.
+        success_threshold: mean node error that counts as success [m].
+        termination_penalty: taken off the reward of the step that ends an episode early.
+        start_distance, start_height: of the clamps in the middle of the start distribution [m].
+        start_noise: half-ranges of the start's clamp positions [m] and tilts [rad].
+        goal_moves: number of random motions of the clamps that lead from the start to the goal.
+        goal_translation: half-range of the clamps' positions over these motions [m].
+        goal_rotation: largest rotation about each clamp axis in one of these motions [rad].
+        goal_distance: smallest and largest mean node distance between start and goal [m].
+        max_stretch: largest distance between the clamps, in lengths of the rod.
+        min_gripper_distance: smallest distance between the clamps [m].
+        workspace: lowest and highest clamp position (2, 3), world [m].
+        check_arms: whether the arms' reach and collisions are checked at every step.
+        cameras: of the scene; the scene's own ``side`` and ``top`` if empty.
+        image_scale: size of the images relative to the cameras'.
+        clutter: ``"none"`` or ``"industrial"``.
+        n_distractor_cables, n_occluders: in the scene; the occluders move.
+        quality: of the rendering, ``"fast"`` or ``"high"``.
+
+    Raises:
+        ValueError: naming the option, what was expected and what came.
+    """
+
+    observer: str = "privileged"
+    observer_options: Mapping[str, Any] = field(default_factory=dict)
+    observation_mode: str = "state"
+    properties: RodProperties = field(default_factory=lambda: RodProperties(length=0.5))
+    n_elements: int = 50
+    control_step: float = 0.1
+    max_translation_step: float = 0.01
+    max_rotation_step: float = float(np.deg2rad(4.5))
+    axial_rotation: bool = False
+    reward: str = "dense"
+    success_threshold: float = 0.005
+    termination_penalty: float = 20.0
+    start_distance: float = 0.4
+    start_height: float = 0.34
+    start_noise: tuple[float, float] = (0.02, float(np.deg2rad(10.0)))
+    goal_moves: int = 3
+    goal_translation: float = 0.12
+    goal_rotation: float = float(np.deg2rad(30.0))
+    goal_distance: tuple[float, float] = (0.06, 0.25)
+    max_stretch: float = 0.97
+    min_gripper_distance: float = 0.12
+    workspace: tuple[tuple[float, float, float], tuple[float, float, float]] = (
+        (-0.4, -0.25, 0.22),
+        (0.4, 0.25, 0.55),
+    )
+    check_arms: bool = True
+    cameras: tuple[CameraModel, ...] = ()
+    image_scale: float = 0.5
+    clutter: str = "none"
+    n_distractor_cables: int = 0
+    n_occluders: int = 0
+    quality: str = "fast"
+
+    def __post_init__(self) -> None:
+        self._check_choice("observation_mode", OBSERVATION_MODES)
+        self._check_choice("reward", REWARDS)
+        if self.observer != "privileged" and not _is_entry_point(self.observer):
+            raise ValueError(
+                f"observer: expected 'privileged' or 'module:Class', got {self.observer!r}"
+            )
+        if not isinstance(self.properties, RodProperties):
+            raise ValueError(f"properties: expected RodProperties, got {self.properties!r}")
+        for name in (
+            "control_step", "max_translation_step", "max_rotation_step", "success_threshold",
+            "start_distance", "start_height", "goal_translation", "max_stretch",
+            "min_gripper_distance", "image_scale",
+        ):  # fmt: skip
+            self._check_number(name, positive=True)
+        self._check_number("termination_penalty")
+        self._check_number("goal_rotation")
+        for name, least in (
+            ("n_elements", 4), ("goal_moves", 1), ("n_distractor_cables", 0), ("n_occluders", 0),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not isinstance(value, int | np.integer) or value < least:
+                raise ValueError(f"{name}: expected an integer of at least {least}, got {value!r}")
+        self._check_pair("start_noise")
+        self._check_pair("goal_distance")
+        if not self.goal_distance[0] < self.goal_distance[1]:
+            raise ValueError(
+                "goal_distance: expected a smallest below a largest distance [m],"
+                f" got {self.goal_distance}"
+            )
+        if self.max_stretch >= 1.0:
+            raise ValueError(f"max_stretch: expected a fraction below 1, got {self.max_stretch}")
+        low, high = np.asarray(self.workspace, dtype=np.float64).reshape(2, 3)
+        if not (low < high).all():
+            raise ValueError(f"workspace: expected (lowest, highest) corners, got {self.workspace}")
+        longest = self.max_stretch * self.properties.length
+        if not self.min_gripper_distance < self.start_distance < longest:
+            raise ValueError(
+                f"start_distance: expected between min_gripper_distance"
+                f" {self.min_gripper_distance} m and {longest:.4g} m, which is max_stretch times"
+                f" the rod's length, got {self.start_distance}"
+            )
+
+    @classmethod
+    def from_options(cls, options: Mapping[str, Any]) -> "ShapeEnvConfig":
+        """The defaults with ``options`` in their place.
+
+        Raises:
+            ValueError: if an option does not exist; lists those that do.
+        """
+        valid = [option.name for option in fields(cls)]
+        unknown = [name for name in options if name not in valid]
+        if unknown:
+            raise ValueError(
+                f"unknown environment option {', '.join(map(repr, unknown))};"
+                f" valid options are: {', '.join(valid)}"
+            )
+        return cls(**options)
+
+    @property
+    def n_nodes(self) -> int:
+        return self.n_elements + 1
+
+    @property
+    def uses_images(self) -> bool:
+        """Whether every step needs the cameras."""
+        return self.observation_mode == "images" or self.observer != "privileged"
+
+    def _check_choice(self, name: str, choices: tuple[str, ...]) -> None:
+        if getattr(self, name) not in choices:
+            raise ValueError(
+                f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}"
+            )
+
+    def _check_number(self, name: str, positive: bool = False) -> None:
+        value = getattr(self, name)
+        if not np.isscalar(value) or not np.isfinite(value) or value < 0 or (positive and not value):
+            kind = "positive" if positive else "non-negative"
+            raise ValueError(f"{name}: expected a finite {kind} number, got {value!r}")
+
+    def _check_pair(self, name: str) -> None:
+        values = np.asarray(getattr(self, name), dtype=np.float64)
+        if values.shape != (2,) or not (values >= 0).all():
+            raise ValueError(
+                f"{name}: expected two non-negative numbers, got {getattr(self, name)!r}"
+            )
+
+
+def _is_entry_point(name: str) -> bool:
+    return isinstance(name, str) and name.count(":") == 1 and all(name.split(":"))

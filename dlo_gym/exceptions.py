@@ -1,0 +1,64 @@
+"""The errors a caller of this project may want to catch."""
+
+from typing import Any
+
+
+class DloError(Exception):
+    """Base of every error this project raises on purpose, apart from ``ValueError``."""
+
+
+class RodDiverged(DloError):
+    """The rod solver found no trustworthy equilibrium.
+
+    Attributes:
+        last_good: the ``RodState`` before the request, to which the rod has been restored.
+    """
+
+    def __init__(self, message: str, last_good: Any = None) -> None:
+        super().__init__(message)
+        self.last_good = last_good
+
+
+class UnreachablePose(DloError):
+    """A TCP pose outside an arm's workspace or joint limits."""
+
+
+class RenderingUnavailable(DloError):
+    """No headless OpenGL context could be made on this machine."""
+
+
+class RecordingError(DloError):
+    """A recording on disk is incomplete, malformed or inconsistent; names the file."""
+
+
+class WeightsError(DloError):
+    """A file of trained weights is missing, damaged or of another version; names the file."""
+
+
+class DatasetError(DloError):
+    """A dataset folder or one of its shards is incomplete or damaged; names the file."""
+
+
+class TrackLost(DloError):
+    """The tracker has not seen the rod for longer than it was allowed to."""
+
+
+class SolverFailed(DloError):
+    """The optimisation behind a controller gave no usable answer."""
+
+
+class SafetyStop(DloError):
+    """A command was refused as a whole and the arms must hold still."""
+
+
+class DeviceError(DloError):
+    """A robot, gripper or camera did not answer as it must."""
+
+
+class MissingExtra(DloError, ImportError):
+    """An optional dependency is not installed; says which pip command adds it."""
+
+    def __init__(self, package: str, extra: str) -> None:
+        super().__init__(
+            f"{package} is not installed; add it with:  pip install 'dlo-gym[{extra}]'"
+        )

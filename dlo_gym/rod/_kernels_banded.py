@@ -1,0 +1,86 @@
+"""Factorisation and solution of symmetric banded systems.
+
+A symmetric matrix H of half-bandwidth 8 is held by its lower band: ``band[j, k] = H[j + k, j]``,
+shape (n_dofs, 9). Only rows and columns ``first <= i < last`` take part; the others are the
+rod's prescribed degrees of freedom and keep their coupling columns untouched.
+"""
+
+import numpy as np
+from numba import njit
+
+HALF_BANDWIDTH = 8
+
+
+@njit(cache=True)
+def factorise(band, first, last):
+    """Update ``band`` to the factors of H = L D L^T; returns the number of negative pivots.
+
+    D stands in ``band[:, 0]``, the unit lower triangle's columns in ``band[:, 1:]``. The number of
+    negative pivots is that of H's negative eigenvalues (Sylvester's law of inertia).
+    """
+    negative = 0
+    for j in range(first, last):
+        pivot = band[j, 0]
+        if pivot <= 0.0:
+            negative += 1
+            if pivot == 0.0:
+                pivot = band[j, 0] = 1e-300
+        reach = min(HALF_BANDWIDTH, last - 1 - j)
+        for k in range(1, reach + 1):
+            factor = band[j, k] / pivot
+            for m in range(k, reach + 1):
+                band[j + k, m - k] -= factor * band[j, m]
+        for k in range(1, reach + 1):
+            band[j, k] /= pivot
+    return negative
+
+
+@njit(cache=True)
+def solve(band, first, last, columns):
+    """Update ``columns`` (n_dofs, m) to H^-1 columns, given the factors of H."""
+    width = columns.shape[1]
+    for j in range(first, last):
+        for k in range(1, min(HALF_BANDWIDTH, last - 1 - j) + 1):
+            factor = band[j, k]
+            for c in range(width):
+                columns[j + k, c] -= factor * columns[j, c]
+    for j in range(last - 1, first - 1, -1):
+        inverse = 1.0 / band[j, 0]
+        for c in range(width):
+            columns[j, c] *= inverse
+        for k in range(1, min(HALF_BANDWIDTH, last - 1 - j) + 1):
+            factor = band[j, k]
+            for c in range(width):
+                columns[j, c] -= factor * columns[j + k, c]
+
+
+@njit(cache=True)
+def multiply_coupling(band, first, last, prescribed, out):
+    """Update ``out`` (n_dofs, m): subtract H_free,prescribed times ``prescribed`` (n_dofs, m).
+
+    Reads the coupling entries that ``factorise`` leaves untouched: columns below ``first`` and
+    rows from ``last`` on.
+    """
+    n_dofs, width = out.shape
+    for j in range(first):
+        for k in range(max(1, first - j), HALF_BANDWIDTH + 1):
+            for c in range(width):
+                out[j + k, c] -= band[j, k] * prescribed[j, c]
+    for j in range(max(first, last - HALF_BANDWIDTH), last):
+        for k in range(last - j, min(HALF_BANDWIDTH, n_dofs - 1 - j) + 1):
+            for c in range(width):
+                out[j, c] -= band[j, k] * prescribed[j + k, c]
+
+
+@njit(cache=True)
+def shift_diagonal(band, first, last, translation, rotation):
+    """Update ``band``: add Levenberg's damping, one value for positions, one for rotations.
+
+    Degrees of freedom alternate: three of a node's position, three of an element's rotation.
+    """
+    for j in range(first, last):
+        band[j, 0] += translation if (j // 3) % 2 == 0 else rotation
+
+
+def empty_band(n_dofs: int) -> np.ndarray:
+    return np.zeros((n_dofs, HALF_BANDWIDTH + 1))

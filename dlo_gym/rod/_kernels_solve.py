@@ -1,0 +1,249 @@
+"""Newton's method on the rod's energy: following a moving clamp, and settling from afar."""
+
+from math import sqrt
+
+import numpy as np
+from numba import njit
+
+from dlo_gym.rod._kernels_banded import factorise, multiply_coupling, shift_diagonal, solve
+from dlo_gym.rod._kernels_energy import assemble, rotate
+
+CONVERGED, STALLED, UNSTABLE = 0, 1, 2
+
+LARGEST_TURN = 0.7  # of an element in one Newton step [rad]; beyond, the quadratic model is void
+NEWTON_STEPS = 16
+
+
+@njit(cache=True)
+def free_range(n, right_held):
+    """The unknowns that are free: all but the held end nodes' positions."""
+    return 3, 6 * n if right_held else 6 * n + 3
+
+
+@njit(cache=True)
+def exact_stress(rod, x, q, stress):
+    """Update ``stress`` (n, 3) with S gamma [N] of the present shape."""
+    for e in range(q.shape[0]):
+        w, a, b, c = q[e, 0], q[e, 1], q[e, 2], q[e, 3]
+        t0 = (x[e + 1, 0] - x[e, 0]) / rod.rest_length[e]
+        t1 = (x[e + 1, 1] - x[e, 1]) / rod.rest_length[e]
+        t2 = (x[e + 1, 2] - x[e, 2]) / rod.rest_length[e]
+        u0, u1, u2 = 2.0 * (b * t2 - c * t1), 2.0 * (c * t0 - a * t2), 2.0 * (a * t1 - b * t0)
+        stress[e, 0] = rod.shear[e, 0] * (t0 - w * u0 + b * u2 - c * u1)
+        stress[e, 1] = rod.shear[e, 1] * (t1 - w * u1 + c * u0 - a * u2)
+        stress[e, 2] = rod.shear[e, 2] * (t2 - w * u2 + a * u1 - b * u0 - 1.0)
+
+
+@njit(cache=True)
+def apply_step(rod, x, q, step, scale, stress):
+    """Update shape by ``scale * step`` and ``stress`` to its linear prediction at the new shape."""
+    n = q.shape[0]
+    exact_stress(rod, x, q, stress)
+    for e in range(n):
+        w, a, b, c = q[e, 0], q[e, 1], q[e, 2], q[e, 3]
+        length = rod.rest_length[e]
+        base = 6 * e
+        # d gamma = R^T dt + p x theta, with R^T v = v - 2 w (u x v) + 2 u x (u x v).
+        t0, t1, t2 = x[e + 1, 0] - x[e, 0], x[e + 1, 1] - x[e, 1], x[e + 1, 2] - x[e, 2]
+        p0, p1, p2 = _rotate_back(w, a, b, c, t0, t1, t2)
+        d0, d1, d2 = _rotate_back(
+            w, a, b, c,
+            step[base + 6] - step[base], step[base + 7] - step[base + 1],
+            step[base + 8] - step[base + 2],
+        )  # fmt: skip
+        r0, r1, r2 = step[base + 3], step[base + 4], step[base + 5]
+        factor = scale / length
+        stress[e, 0] += rod.shear[e, 0] * factor * (d0 + p1 * r2 - p2 * r1)
+        stress[e, 1] += rod.shear[e, 1] * factor * (d1 + p2 * r0 - p0 * r2)
+        stress[e, 2] += rod.shear[e, 2] * factor * (d2 + p0 * r1 - p1 * r0)
+    for i in range(n + 1):
+        for k in range(3):
+            x[i, k] += scale * step[6 * i + k]
+    for e in range(n):
+        rotate(q[e], scale * step[6 * e + 3], scale * step[6 * e + 4], scale * step[6 * e + 5])
+
+
+@njit(cache=True)
+def _rotate_back(w, a, b, c, t0, t1, t2):
+    u0, u1, u2 = 2.0 * (b * t2 - c * t1), 2.0 * (c * t0 - a * t2), 2.0 * (a * t1 - b * t0)
+    return t0 - w * u0 + b * u2 - c * u1, t1 - w * u1 + c * u0 - a * u2, t2 - w * u2 + a * u1 - b * u0
+
+
+@njit(cache=True)
+def _largest_turn(step, n):
+    largest = 0.0
+    for e in range(n):
+        s = 6 * e + 3
+        largest = max(largest, step[s] ** 2 + step[s + 1] ** 2 + step[s + 2] ** 2)
+    return sqrt(largest)
+
+
+@njit(cache=True)
+def _residual(gradient, first, last, force_scale, torque_scale):
+    """The largest free component of the gradient, relative to the scales [N], [N m]."""
+    largest = 0.0
+    for j in range(first, last):
+        scale = force_scale if (j // 3) % 2 == 0 else torque_scale
+        size = abs(gradient[j]) / scale
+        if not size <= largest:  # a NaN counts as large
+            largest = size
+    return largest
+
+
+@njit(cache=True)
+def linearise(rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms):
+    """Factorise the Hessian at an equilibrium; returns (energy, number of negative pivots)."""
+    exact_stress(rod, x, q, stress)
+    energy = assemble(rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms, True)
+    first, last = free_range(q.shape[0], right_held)
+    return energy, factorise(band, first, last)
+
+
+@njit(cache=True)
+def sensitivity(band, clamp_terms, clamp_rotations, right_held, columns):
+    """Update ``columns`` (n_dofs, 12) with d(unknowns)/d(clamp twists) at a factorised state.
+
+    Twists are in world axes, translation then rotation about the clamp, left then right.
+    """
+    n_dofs = columns.shape[0]
+    n = (n_dofs - 3) // 6
+    first, last = free_range(n, right_held)
+    prescribed = np.zeros((n_dofs, 12))
+    columns[:] = 0.0
+    for k in range(3):
+        prescribed[k, k] = 1.0
+        if right_held:
+            prescribed[6 * n + k, 6 + k] = 1.0
+    multiply_coupling(band, first, last, prescribed, columns)
+    for side in range(2 if right_held else 1):
+        theta = 3 if side == 0 else 6 * n - 3
+        for i in range(3):
+            for j in range(3):
+                coupling = 0.0
+                for k in range(3):  # a turn w in world is R^T w in the clamp's frame
+                    coupling += clamp_terms[side, 1 + i, k] * clamp_rotations[side, j, k]
+                columns[theta + i, 6 * side + 3 + j] -= coupling
+    solve(band, first, last, columns)
+    for k in range(3):
+        columns[k, k] = 1.0
+        if right_held:
+            columns[6 * n + k, 6 + k] = 1.0
+
+
+@njit(cache=True)
+def follow(
+    rod, x, q, clamps, right_held, twist, clamp_rotations, tolerance, force_scale, torque_scale,
+    stress, gradient, band, clamp_terms,
+):  # fmt: skip
+    """Move the clamps by ``twist`` (12,) and update the shape to the new equilibrium.
+
+    On entry ``band`` holds the factors at the present equilibrium. The first step is their
+    linear answer to the moving clamps; then Newton's method with predicted stresses.
+    ``clamps`` must already hold the new quaternions. Returns a status and the energy [J].
+    """
+    n = q.shape[0]
+    n_dofs = 6 * n + 3
+    first, last = free_range(n, right_held)
+    step = np.zeros((n_dofs, 1))
+    prescribed = np.zeros((n_dofs, 1))
+    for k in range(3):
+        prescribed[k, 0] = twist[k]
+        if right_held:
+            prescribed[6 * n + k, 0] = twist[6 + k]
+    for j in range(first, last):
+        step[j, 0] = -gradient[j]
+    multiply_coupling(band, first, last, prescribed, step)
+    for side in range(2 if right_held else 1):
+        theta = 3 if side == 0 else 6 * n - 3
+        for k in range(3):
+            turn = 0.0
+            for j in range(3):
+                turn += clamp_rotations[side, j, k] * twist[6 * side + 3 + j]
+            for i in range(3):
+                step[theta + i, 0] -= clamp_terms[side, 1 + i, k] * turn
+    for count in range(NEWTON_STEPS):
+        solve(band, first, last, step)
+        if count == 0:
+            for j in range(n_dofs):
+                if j < first or j >= last:
+                    step[j, 0] = prescribed[j, 0]
+        turn = _largest_turn(step[:, 0], n)
+        if not turn < LARGEST_TURN:
+            return STALLED, 0.0
+        apply_step(rod, x, q, step[:, 0], 1.0, stress)
+        assemble(rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms, True)
+        if _residual(gradient, first, last, force_scale, torque_scale) < tolerance:
+            energy, negative = linearise(
+                rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms
+            )
+            return (UNSTABLE if negative else CONVERGED), energy
+        factorise(band, first, last)
+        step[:, 0] = 0.0
+        for j in range(first, last):
+            step[j, 0] = -gradient[j]
+    return STALLED, 0.0
+
+
+@njit(cache=True)
+def minimise(
+    rod, x, q, clamps, right_held, tolerance, force_scale, torque_scale, max_steps,
+    stress, gradient, band, clamp_terms,
+):  # fmt: skip
+    """Descend the energy from any shape to a stable equilibrium (Levenberg's damped Newton).
+
+    Every step lowers the energy; the Hessian is shifted until it is positive definite. Leaves
+    ``band`` factorised at the solution. Returns a status and the steps taken.
+    """
+    n = q.shape[0]
+    n_dofs = 6 * n + 3
+    first, last = free_range(n, right_held)
+    rotation = torque_scale * n
+    translation = rotation / rod.rest_length[0] ** 2
+    damping = 1e-3
+    step = np.zeros((n_dofs, 1))
+    x_trial, q_trial = x.copy(), q.copy()
+    exact_stress(rod, x, q, stress)
+    energy = assemble(rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms, True)
+    undamped = band.copy()
+    for count in range(max_steps):
+        residual = _residual(gradient, first, last, force_scale, torque_scale)
+        if residual < tolerance:
+            band[:] = undamped
+            if factorise(band, first, last) == 0:
+                return CONVERGED, count
+        accepted = False
+        for _ in range(60):
+            band[:] = undamped
+            shift_diagonal(band, first, last, damping * translation, damping * rotation)
+            if factorise(band, first, last) > 0:
+                damping = max(4.0 * damping, 1e-9)
+                continue
+            step[:, 0] = 0.0
+            for j in range(first, last):
+                step[j, 0] = -gradient[j]
+                if residual < tolerance:  # a saddle: leave it in a fixed, generic direction
+                    step[j, 0] = 1e-3 * torque_scale * np.cos(1.0 + 0.7 * j)
+            solve(band, first, last, step)
+            turn = _largest_turn(step[:, 0], n)
+            scale = min(1.0, 0.5 * LARGEST_TURN / max(turn, 1e-300))
+            x_trial[:] = x
+            q_trial[:] = q
+            apply_step(rod, x_trial, q_trial, step[:, 0], scale, stress)
+            trial = assemble(
+                rod, x_trial, q_trial, clamps, right_held, stress, gradient, band, clamp_terms, False
+            )
+            floor = 1e-13 * abs(energy)
+            if trial < energy + floor or residual < tolerance:
+                accepted = True
+                damping = damping / 5.0 if scale == 1.0 else damping
+                break
+            damping = max(4.0 * damping, 1e-9)
+            assemble(rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms, False)
+        if not accepted:
+            return STALLED, count
+        x[:] = x_trial
+        q[:] = q_trial
+        exact_stress(rod, x, q, stress)
+        energy = assemble(rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms, True)
+        undamped[:] = band
+    return STALLED, max_steps

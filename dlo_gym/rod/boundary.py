@@ -1,0 +1,126 @@
+"""What the grippers impose on the rod's ends."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dlo_gym.geometry.se3 import Array, check_pose, exp_so3, log_so3
+
+
+@dataclass(frozen=True, eq=False)
+class BoundaryPoses:
+    """World poses of the material frames at the rod's ends.
+
+    Each is (4, 4): columns d1 d2 d3, with d3 the tangent towards increasing arc length at BOTH
+    ends; the origin is the end node [m]. The left clamp holds node 0. ``right=None`` leaves the
+    last node free.
+
+    Raises:
+        ValueError: if a pose is not rigid.
+    """
+
+    left: Array
+    right: Array | None = None
+
+    def __post_init__(self) -> None:
+        for side in ("left", "right"):
+            value = getattr(self, side)
+            if value is not None:
+                object.__setattr__(self, side, check_pose(value, f"clamp {side}"))
+
+    @property
+    def distance(self) -> float:
+        """Between the two clamps' origins [m]; 0 if one end is free."""
+        if self.right is None:
+            return 0.0
+        return float(np.linalg.norm(self.right[:3, 3] - self.left[:3, 3]))
+
+    def displaced(self, displacement: "BoundaryDisplacement") -> "BoundaryPoses":
+        """The poses after ``displacement``."""
+        if (self.right is None) != (displacement.right is None):
+            raise ValueError(
+                "displacement: must move the right clamp exactly if it exists, got "
+                f"right={displacement.right} for right clamp {self.right}"
+            )
+        right = None if self.right is None else _displace(self.right, displacement.right)
+        return BoundaryPoses(_displace(self.left, displacement.left), right)
+
+    def displacement_to(self, target: "BoundaryPoses") -> "BoundaryDisplacement":
+        """The displacement that takes these poses to ``target``."""
+        right = None
+        if self.right is not None and target.right is not None:
+            right = _difference(self.right, target.right)
+        return BoundaryDisplacement(_difference(self.left, target.left), right)
+
+
+@dataclass(frozen=True, eq=False)
+class BoundaryDisplacement:
+    """A motion of the clamps: per end a translation [m] and a rotation vector [rad].
+
+    Each is (6,) in world axes: dx dy dz rx ry rz; the rotation is about the clamp's own origin.
+    ``right=None`` where the right end is free.
+
+    Raises:
+        ValueError: on a wrong shape or a value that is not finite.
+    """
+
+    left: Array
+    right: Array | None = None
+
+    def __post_init__(self) -> None:
+        for side in ("left", "right"):
+            value = getattr(self, side)
+            if value is None and side == "right":
+                continue
+            value = np.ascontiguousarray(value, dtype=np.float64)
+            if value.shape != (6,) or not np.isfinite(value).all():
+                raise ValueError(
+                    f"displacement {side}: expected 6 finite numbers"
+                    f" (translation [m], rotation vector [rad]), got {value}"
+                )
+            object.__setattr__(self, side, value)
+
+    @classmethod
+    def zero(cls) -> "BoundaryDisplacement":
+        return cls(np.zeros(6), np.zeros(6))
+
+    @classmethod
+    def from_vector(cls, vector: ArrayLike) -> "BoundaryDisplacement":
+        """From (12,) left then right, or (6,) for a rod held by the left clamp only."""
+        vector = np.asarray(vector, dtype=np.float64)
+        if vector.shape not in ((6,), (12,)):
+            raise ValueError(f"displacement: expected 6 or 12 numbers, got shape {vector.shape}")
+        return cls(vector[:6], vector[6:] if vector.size == 12 else None)
+
+    @property
+    def vector(self) -> Array:
+        """(12,) left then right, or (6,) if the right end is free."""
+        return self.left.copy() if self.right is None else np.concatenate([self.left, self.right])
+
+    def scaled(self, factor: float) -> "BoundaryDisplacement":
+        return BoundaryDisplacement.from_vector(factor * self.vector)
+
+    def without_axial_rotation(self, boundary: BoundaryPoses) -> "BoundaryDisplacement":
+        """The same without rotation about the rod's own axis (d3) at each clamp of ``boundary``."""
+        parts = []
+        for twist, clamp in ((self.left, boundary.left), (self.right, boundary.right)):
+            if twist is not None and clamp is not None:
+                twist = twist.copy()
+                twist[3:] -= clamp[:3, 2] * (clamp[:3, 2] @ twist[3:])
+            parts.append(twist)
+        return BoundaryDisplacement(*parts)
+
+
+def _displace(clamp: Array, twist: Array | None) -> Array:
+    assert twist is not None
+    moved = clamp.copy()
+    rotation = exp_so3(twist[3:]) @ clamp[:3, :3]
+    # One Newton step towards the nearest rotation keeps long sequences of moves orthonormal.
+    moved[:3, :3] = 1.5 * rotation - 0.5 * rotation @ rotation.T @ rotation
+    moved[:3, 3] += twist[:3]
+    return moved
+
+
+def _difference(start: Array, end: Array) -> Array:
+    return np.concatenate([end[:3, 3] - start[:3, 3], log_so3(end[:3, :3] @ start[:3, :3].T)])

@@ -1,0 +1,105 @@
+"""What a rod is made of."""
+
+from dataclasses import dataclass
+from math import isfinite, pi
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dlo_gym.geometry.se3 import Array
+
+# Shear correction factor of a solid circular section (Cowper 1966, nu = 0.5; PyElastica's value).
+SHEAR_CORRECTION = 27.0 / 28.0
+
+
+@dataclass(frozen=True)
+class RodProperties:
+    """A rod of solid circular cross-section.
+
+    Scalars describe a uniform rod. Radius, Young's modulus and density also take one value per
+    element, shape (n_elements,).
+
+    Attributes:
+        length: rest length [m].
+        radius: of the cross-section [m].
+        youngs_modulus: E [Pa].
+        density: [kg/m^3].
+        poisson_ratio: nu; the shear modulus is G = E / (2 (1 + nu)).
+        rest_curvature: (3,) or (n_elements - 1, 3) curvature and twist of the unloaded rod in
+            its material frame [1/m]: about d1, about d2, and twist about d3.
+
+    Raises:
+        ValueError: naming the field, if a value is not finite or not physical.
+    """
+
+    length: float
+    radius: float | Array = 0.003
+    youngs_modulus: float | Array = 1e6
+    density: float | Array = 1e3
+    poisson_ratio: float = 0.5
+    rest_curvature: Array | tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not (isfinite(self.length) and self.length > 0):
+            raise ValueError(f"length: expected a positive length [m], got {self.length}")
+        for name in ("radius", "youngs_modulus", "density"):
+            values = np.asarray(getattr(self, name), dtype=np.float64)
+            if values.ndim > 1 or not np.isfinite(values).all() or not (values > 0).all():
+                raise ValueError(
+                    f"{name}: expected a positive number or one per element, got {values}"
+                )
+        if not -1.0 < self.poisson_ratio <= 0.5:
+            raise ValueError(f"poisson_ratio: expected -1 < nu <= 0.5, got {self.poisson_ratio}")
+        rest = np.asarray(self.rest_curvature, dtype=np.float64)
+        if rest.shape[-1:] != (3,) or rest.ndim > 2 or not np.isfinite(rest).all():
+            raise ValueError(
+                "rest_curvature: expected finite values of shape (3,) or (n_elements - 1, 3),"
+                f" got shape {rest.shape}"
+            )
+
+    @property
+    def area(self) -> float | Array:
+        """A [m^2]."""
+        return pi * np.square(self.radius)
+
+    @property
+    def shear_modulus(self) -> float | Array:
+        """G [Pa]."""
+        return self.youngs_modulus / (2.0 * (1.0 + self.poisson_ratio))
+
+    @property
+    def bending_stiffness(self) -> float | Array:
+        """EI [N m^2]."""
+        return self.youngs_modulus * np.square(self.area) / (4.0 * pi)
+
+    @property
+    def twisting_stiffness(self) -> float | Array:
+        """GJ [N m^2]."""
+        return self.shear_modulus * np.square(self.area) / (2.0 * pi)
+
+    @property
+    def stretching_stiffness(self) -> float | Array:
+        """EA [N]."""
+        return self.youngs_modulus * self.area
+
+    @property
+    def shearing_stiffness(self) -> float | Array:
+        """kGA [N], k the shear correction factor."""
+        return SHEAR_CORRECTION * self.shear_modulus * self.area
+
+    @property
+    def linear_density(self) -> float | Array:
+        """Mass per length [kg/m]."""
+        return self.density * self.area
+
+
+def per_element(values: ArrayLike, n_elements: int, name: str) -> Array:
+    """A scalar or (n_elements,) property as an array (n_elements,).
+
+    Raises:
+        ValueError: naming the property, if it has another number of values.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    if values.ndim and values.shape != (n_elements,):
+        raise ValueError(f"{name}: expected one value per element, {n_elements}, got {len(values)}")
+    return np.ascontiguousarray(np.broadcast_to(values, n_elements))

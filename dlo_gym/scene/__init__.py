@@ -1,0 +1,1 @@
+"""The dual-arm cell in MuJoCo: arms, table, cameras, renderer."""

@@ -1,0 +1,1 @@
+"""The rod's neural surrogate: rollouts, training, prediction."""
