@@ -83,7 +83,7 @@ class CameraModel:
         position = np.asarray(position, dtype=np.float64)
         forward = np.asarray(target, dtype=np.float64) - position
         forward /= np.linalg.norm(forward)
-        right = np.cross(forward, up)
+        right = np.cross(forward, np.asarray(up, dtype=np.float64))
         if np.linalg.norm(right) < 1e-9:
             raise ValueError(f"camera {name!r}: up {up} is parallel to the viewing direction")
         right /= np.linalg.norm(right)
@@ -128,9 +128,7 @@ class CameraModel:
         pixels = np.asarray(pixels, dtype=np.float64)
         flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2))
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-12)
-        normalised = cv2.undistortPoints(
-            flat, self.K, self.distortion, criteria=criteria
-        )
+        normalised = cv2.undistortPoints(flat, self.K, self.distortion, criteria=criteria)
         directions = np.concatenate(
             [normalised.reshape(-1, 2), np.ones((normalised.shape[0], 1))], axis=1
         )
@@ -142,7 +140,7 @@ class CameraModel:
         pixels = np.asarray(pixels, dtype=np.float64)
         with np.errstate(invalid="ignore"):
             inside = (pixels >= -0.5) & (pixels < [self.width - 0.5, self.height - 0.5])
-        return inside.all(axis=-1)
+        return np.asarray(inside.all(axis=-1))
 
     def scaled(self, factor: float) -> "CameraModel":
         """The same camera with its image resized by ``factor`` (0.5 halves width and height)."""

@@ -52,10 +52,11 @@ def _minimal_rotation(a: Array, b: Array) -> Array:
     axis = np.cross(a, b)
     cosine = float(np.dot(a, b))
     if cosine < -1.0 + 1e-9:  # opposite: half a turn about any perpendicular
-        perpendicular = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+        axis = np.eye(3)[np.argmin(np.abs(a))]
+        perpendicular = axis - (axis @ a) * a
         perpendicular /= np.linalg.norm(perpendicular)
-        return 2.0 * np.outer(perpendicular, perpendicular) - np.eye(3)
-    skew = np.array(
-        [[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]]
-    )
-    return np.eye(3) + skew + skew @ skew / (1.0 + cosine)
+        return 2.0 * perpendicular[:, None] * perpendicular - np.eye(3)
+    x, y, z = axis
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    rotation: Array = np.eye(3) + skew + skew @ skew / (1.0 + cosine)
+    return rotation

@@ -71,8 +71,9 @@ def frame_along(tangent: ArrayLike, reference: ArrayLike) -> Array:
     """
     tangent = np.asarray(tangent, dtype=np.float64)
     d3 = tangent / np.linalg.norm(tangent)
-    across = np.asarray(reference, dtype=np.float64) - np.dot(reference, d3) * d3
-    norm = np.linalg.norm(across)
+    across = np.asarray(reference, dtype=np.float64)
+    across = across - float(across @ d3) * d3
+    norm = float(np.linalg.norm(across))
     if not norm > 1e-9:
         raise ValueError(f"reference {reference} must not be parallel to tangent {tangent}")
     d1 = across / norm

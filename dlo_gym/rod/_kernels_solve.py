@@ -21,6 +21,17 @@ def free_range(n, right_held):
 
 
 @njit(cache=True)
+def _rotate_back(w, a, b, c, t0, t1, t2):
+    """R^T t for the rotation R of the unit quaternion (w, a, b, c)."""
+    u0, u1, u2 = 2.0 * (b * t2 - c * t1), 2.0 * (c * t0 - a * t2), 2.0 * (a * t1 - b * t0)
+    return (
+        t0 - w * u0 + b * u2 - c * u1,
+        t1 - w * u1 + c * u0 - a * u2,
+        t2 - w * u2 + a * u1 - b * u0,
+    )
+
+
+@njit(cache=True)
 def exact_stress(rod, x, q, stress):
     """Update ``stress`` (n, 3) with S gamma [N] of the present shape."""
     for e in range(q.shape[0]):
@@ -28,10 +39,10 @@ def exact_stress(rod, x, q, stress):
         t0 = (x[e + 1, 0] - x[e, 0]) / rod.rest_length[e]
         t1 = (x[e + 1, 1] - x[e, 1]) / rod.rest_length[e]
         t2 = (x[e + 1, 2] - x[e, 2]) / rod.rest_length[e]
-        u0, u1, u2 = 2.0 * (b * t2 - c * t1), 2.0 * (c * t0 - a * t2), 2.0 * (a * t1 - b * t0)
-        stress[e, 0] = rod.shear[e, 0] * (t0 - w * u0 + b * u2 - c * u1)
-        stress[e, 1] = rod.shear[e, 1] * (t1 - w * u1 + c * u0 - a * u2)
-        stress[e, 2] = rod.shear[e, 2] * (t2 - w * u2 + a * u1 - b * u0 - 1.0)
+        p0, p1, p2 = _rotate_back(w, a, b, c, t0, t1, t2)
+        stress[e, 0] = rod.shear[e, 0] * p0
+        stress[e, 1] = rod.shear[e, 1] * p1
+        stress[e, 2] = rod.shear[e, 2] * (p2 - 1.0)
 
 
 @njit(cache=True)
@@ -43,7 +54,7 @@ def apply_step(rod, x, q, step, scale, stress):
         w, a, b, c = q[e, 0], q[e, 1], q[e, 2], q[e, 3]
         length = rod.rest_length[e]
         base = 6 * e
-        # d gamma = R^T dt + p x theta, with R^T v = v - 2 w (u x v) + 2 u x (u x v).
+        # d gamma = (R^T d(t) + p x theta) / l
         t0, t1, t2 = x[e + 1, 0] - x[e, 0], x[e + 1, 1] - x[e, 1], x[e + 1, 2] - x[e, 2]
         p0, p1, p2 = _rotate_back(w, a, b, c, t0, t1, t2)
         d0, d1, d2 = _rotate_back(
@@ -61,12 +72,6 @@ def apply_step(rod, x, q, step, scale, stress):
             x[i, k] += scale * step[6 * i + k]
     for e in range(n):
         rotate(q[e], scale * step[6 * e + 3], scale * step[6 * e + 4], scale * step[6 * e + 5])
-
-
-@njit(cache=True)
-def _rotate_back(w, a, b, c, t0, t1, t2):
-    u0, u1, u2 = 2.0 * (b * t2 - c * t1), 2.0 * (c * t0 - a * t2), 2.0 * (a * t1 - b * t0)
-    return t0 - w * u0 + b * u2 - c * u1, t1 - w * u1 + c * u0 - a * u2, t2 - w * u2 + a * u1 - b * u0
 
 
 @njit(cache=True)
@@ -230,7 +235,16 @@ def minimise(
             q_trial[:] = q
             apply_step(rod, x_trial, q_trial, step[:, 0], scale, stress)
             trial = assemble(
-                rod, x_trial, q_trial, clamps, right_held, stress, gradient, band, clamp_terms, False
+                rod,
+                x_trial,
+                q_trial,
+                clamps,
+                right_held,
+                stress,
+                gradient,
+                band,
+                clamp_terms,
+                False,
             )
             floor = 1e-13 * abs(energy)
             if trial < energy + floor or residual < tolerance:

@@ -1,5 +1,8 @@
 """Shapes to start a rod from: straight, arc, catenary, hanging between clamps, random clamps."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
@@ -43,8 +46,8 @@ def catenary(start: ArrayLike, end: ArrayLike, length: float, n_nodes: int) -> A
         )
     if d < 1e-6 * length:
         raise ValueError("start, end: expected a horizontal span, got points above each other")
-    ratio = np.sqrt(length**2 - v**2) / d
-    half = brentq(lambda z: np.sinh(z) / z - ratio, 1e-9, 10.0 + 2.0 * np.log(ratio), xtol=1e-15)
+    ratio = float(np.sqrt(length**2 - v**2)) / d
+    half = _root(lambda z: np.sinh(z) / z - ratio, 1e-9, 10.0 + 2.0 * np.log(ratio))
     a = d / (2.0 * half)
     middle = a * np.arcsinh(v / (2.0 * a * np.sinh(half)))  # of the span, left of the lowest point
     lowest = d / 2.0 - middle
@@ -82,8 +85,8 @@ def hanging(boundary: BoundaryPoses, length: float, n_nodes: int) -> Array:
     handle = 0.3 * max(span, 0.3 * length)
     while excess(handle, 0.0) > 0.0 and handle > 1e-3 * length:
         handle *= 0.7
-    sag = brentq(lambda s: excess(handle, s), 0.0, length) if excess(handle, 0.0) < 0.0 else 0.0
-    return curves.resample(curve(handle, float(sag)), n_nodes)
+    sag = _root(lambda s: excess(handle, s), 0.0, length) if excess(handle, 0.0) < 0.0 else 0.0
+    return curves.resample(curve(handle, sag), n_nodes)
 
 
 def random_boundary(rng: np.random.Generator, length: float) -> BoundaryPoses:
@@ -105,3 +108,8 @@ def random_boundary(rng: np.random.Generator, length: float) -> BoundaryPoses:
         bend = exp_so3([tilt * np.cos(azimuth), tilt * np.sin(azimuth), 0.0])
         clamps.append(pose(level @ bend @ exp_so3([0.0, 0.0, twist]), centre + side * span * along))
     return BoundaryPoses(*clamps)
+
+
+def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    root: Any = brentq(function, low, high, xtol=1e-15)
+    return float(root)

@@ -146,27 +146,27 @@ class CosseratRod:
         self._check_reach(target)
         saved = self._x.copy(), self._q.copy()
         vector = displacement.vector
-        size = self._move_size(vector)
-        done, fraction = 0.0, 1.0 / max(1.0, np.ceil(size))
+        full_stride = 1.0 / max(1.0, np.ceil(self._move_size(vector)))
+        done, stride = 0.0, full_stride
         while done < 1.0:
-            fraction = min(fraction, 1.0 - done)
-            end = target if done + fraction > 1.0 - 1e-12 else _between(before, vector, done + fraction)
-            if self._follow(end, fraction * vector):
-                done = 1.0 if end is target else done + fraction
+            reached = done + stride if done + stride < 1.0 - 1e-9 else 1.0
+            end = target if reached == 1.0 else before.displaced(displacement.scaled(reached))
+            if self._follow(end, (reached - done) * vector):
+                done = reached
                 continue
-            fraction *= 0.5
-            if fraction < SMALLEST_SUBSTEP / max(1.0, size):
-                problem = self._jump(end)
-                if problem:
-                    self._set(*saved, before)
-                    self._linearise()
-                    raise RodDiverged(
-                        f"the equilibrium was lost at {100 * (done + fraction):.0f} % of a move by"
-                        f" {np.array2string(vector, precision=4)} [m, rad]: {problem}",
-                        last_good=self.state,
-                    )
-                done, fraction = done + 2.0 * fraction, 1.0 / max(1.0, np.ceil(size))
-                done = 1.0 if end is target else done
+            stride *= 0.5
+            if stride >= SMALLEST_SUBSTEP * full_stride:
+                continue
+            problem = self._jump(end)
+            if problem:
+                self._set(*saved, before)
+                self._linearise()
+                raise RodDiverged(
+                    f"the equilibrium was lost at {100 * reached:.0f} % of a move by"
+                    f" {np.array2string(vector, precision=4)} [m, rad]: {problem}",
+                    last_good=self.state,
+                )
+            done, stride = reached, full_stride
         return self.state
 
     @property
@@ -285,7 +285,9 @@ class CosseratRod:
         """A move's size in sub-steps that Newton's method takes with ease."""
         ends = vector.reshape(-1, 2, 3)
         translation, rotation = np.linalg.norm(ends, axis=-1).max(axis=0)
-        return max(translation / (LARGEST_MOVE[0] * self.properties.length), rotation / LARGEST_MOVE[1])
+        return max(
+            translation / (LARGEST_MOVE[0] * self.properties.length), rotation / LARGEST_MOVE[1]
+        )
 
     def _jump(self, end: BoundaryPoses) -> str:
         """Past a loss of stability: descend to the equilibrium that the rod snaps to."""
@@ -374,7 +376,3 @@ def _frames_along(positions: Array, boundary: BoundaryPoses) -> Array:
         angles = twist * (np.arange(len(frames)) + 0.5) / len(frames)
         frames = frames @ exp_so3(angles[:, None] * np.array([0.0, 0.0, 1.0]))
     return matrix_to_quaternion(frames)
-
-
-def _between(boundary: BoundaryPoses, vector: Array, fraction: float) -> BoundaryPoses:
-    return boundary.displaced(BoundaryDisplacement.from_vector(fraction * vector))

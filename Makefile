@@ -1,0 +1,66 @@
+# make demo: set up and run the main job.   make test: set up and pass the tests.
+
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+PYTHON ?= $(firstword $(shell command -v python3.12 python3.11 python3))
+OUT    ?= out/demo
+
+# Numerical libraries run one thread each: faster here, and steadier, than two on small problems.
+export OMP_NUM_THREADS = 1
+export OPENBLAS_NUM_THREADS = 1
+export MUJOCO_GL ?= egl
+
+.PHONY: demo test test-all bench lint clean egl
+
+demo: $(VENV)/.base egl
+	$(BIN)/dlo demo --out $(OUT) --overwrite
+
+test: lint egl
+	$(BIN)/pytest
+
+test-all: lint egl
+	$(BIN)/pytest -m "slow or not slow"
+
+bench: $(VENV)/.all egl
+	$(BIN)/python -m benchmarks
+
+lint: $(VENV)/.all
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/lint-imports
+
+clean:
+	rm -rf $(VENV) out runs build *.egg-info .pytest_cache .ruff_cache .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Setting up -------------------------------------------------------------------------------------
+
+$(VENV)/.venv:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "dlo-gym needs Python 3.11 or 3.12; say which with  make PYTHON=python3.12"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --upgrade pip
+	@touch $@
+
+$(VENV)/.base: $(VENV)/.venv pyproject.toml constraints.txt
+	$(BIN)/pip install --quiet -c constraints.txt -e .
+	@touch $@
+
+$(VENV)/.all: $(VENV)/.venv pyproject.toml constraints.txt
+	$(BIN)/pip install --quiet -c constraints.txt -e '.[all]'
+	@touch $@ $(VENV)/.base
+
+EGL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri
+
+# MuJoCo renders headless through EGL, a system library.
+egl:
+	@ldconfig -p 2>/dev/null | grep -q libEGL.so.1 && exit 0; \
+	if command -v apt-get >/dev/null && [ "$$(id -u)" = 0 ]; then \
+	  apt-get update -qq && apt-get install -y -qq $(EGL_PACKAGES); \
+	elif command -v apt-get >/dev/null && sudo -n true 2>/dev/null; then \
+	  sudo apt-get update -qq && sudo apt-get install -y -qq $(EGL_PACKAGES); \
+	else \
+	  echo "libEGL is missing; install it, on Debian or Ubuntu:  sudo apt-get install $(EGL_PACKAGES)"; \
+	  exit 1; \
+	fi
