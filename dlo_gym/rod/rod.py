@@ -18,7 +18,7 @@ from dlo_gym.rod.state import RodState
 GRAVITY = (0.0, 0.0, -9.81)
 TOLERANCE = 1e-9  # residual relative to the rod's own weight and stiffness
 RIGID_JOINT = 1e-3  # of an element: the piece between clamp and element when it holds the element
-LARGEST_STRAIN = 0.25
+LARGEST_STRAIN = 0.25  # beside what a few times the rod's own weight stretches
 LARGEST_BEND = 2.4  # between neighbouring elements [rad]
 LARGEST_MOVE = (0.08, 0.3)  # of one sub-step: translation per rod length, rotation [rad]
 SMALLEST_SUBSTEP = 1.0 / 64.0
@@ -66,6 +66,8 @@ class CosseratRod:
         rounding = 8.0 * np.finfo(np.float64).eps * element_stiffness
         self._force_scale = stiffness / properties.length**2 + weight + rounding / TOLERANCE
         self._torque_scale = stiffness / properties.length + weight * properties.length / n_elements
+        softest = self._arrays.shear[:, 2].min()
+        self._largest_strain = LARGEST_STRAIN + 3.0 * weight / softest
         n_dofs = 6 * n_elements + 3
         self._gradient = np.zeros(n_dofs)
         self._band = np.zeros((n_dofs, 9))
@@ -302,8 +304,8 @@ class CosseratRod:
         strain, curvature = np.empty((n, 3)), np.empty((n - 1, 3))
         energy_kernels.strains(self._arrays, self._x, self._q, strain, curvature)
         largest = float(np.abs(strain).max())
-        if not largest < LARGEST_STRAIN:
-            return f"an element is strained by {largest:.2g}, beyond {LARGEST_STRAIN}"
+        if not largest < self._largest_strain:
+            return f"an element is strained by {largest:.2g}, beyond {self._largest_strain:.2g}"
         voronoi = self._arrays.voronoi_length[1:-1]
         bend = float((np.linalg.norm(curvature, axis=1) * voronoi).max())
         if not bend < LARGEST_BEND:
