@@ -46,10 +46,11 @@ class CameraModel:
         K = np.ascontiguousarray(self.K, dtype=np.float64)
         if K.shape != (3, 3) or not np.isfinite(K).all():
             raise ValueError(f"camera {self.name!r}: K must be a finite 3x3 matrix, got {self.K}")
-        if not (K[0, 0] > 0 and K[1, 1] > 0) or not np.array_equal(K[2], [0.0, 0.0, 1.0]):
+        fixed = [K[0, 1], K[1, 0], *K[2]]
+        if not (K[0, 0] > 0 and K[1, 1] > 0) or fixed != [0.0, 0.0, 0.0, 0.0, 1.0]:
             raise ValueError(
-                f"camera {self.name!r}: K must have positive focal lengths and last row 0 0 1,"
-                f" got {K.tolist()}"
+                f"camera {self.name!r}: K must have positive focal lengths, no skew and the last"
+                f" row 0 0 1, got {K.tolist()}"
             )
         distortion = np.zeros(5) if self.distortion is None else self.distortion
         distortion = np.ascontiguousarray(distortion, dtype=np.float64)
@@ -120,7 +121,7 @@ class CameraModel:
             normalised = in_camera[ahead, :2] / in_camera[ahead, 2:]
             if self.is_distorted:
                 normalised = _distort(normalised, self.distortion)
-            pixels[ahead] = normalised @ self.K[:2, :2].T + self.K[:2, 2]
+            pixels[ahead] = normalised * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
         return pixels.reshape(*points.shape[:-1], 2)
 
     def rays(self, pixels: ArrayLike) -> Array:

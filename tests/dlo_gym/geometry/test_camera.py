@@ -66,6 +66,7 @@ def test_scaled_camera_sees_the_resized_image(factor):
         ({"width": 0}, "image size"),
         ({"K": np.eye(2)}, "K must"),
         ({"K": np.diag([-1.0, 1.0, 1.0])}, "focal"),
+        ({"K": np.eye(3) + np.diag([0.1, 0.0], 1)}, "skew"),
         ({"distortion": np.zeros(4)}, "distortion"),
         ({"T_world_camera": 2 * np.eye(4)}, "rigid"),
     ],
