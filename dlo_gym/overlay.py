@@ -37,9 +37,9 @@ def draw_centerline(
     pixels = camera.project(centerline)
     width = max(1, round(thickness * camera.height / 1080))
     limit = 4.0 * max(camera.width, camera.height)
-    drawable = np.isfinite(pixels).all(axis=1) & (np.abs(np.nan_to_num(pixels)) < limit).all(axis=1)
-    fixed = np.round(np.where(drawable[:, None], pixels, 0.0) * 2**_SHIFT).astype(np.int32)
-    seen = np.ones(len(pixels), dtype=bool) if visible is None else np.asarray(visible, dtype=bool)
+    drawable = (np.abs(np.nan_to_num(pixels, nan=2.0 * limit)) < limit).min(axis=1).tolist()
+    fixed = np.round(np.nan_to_num(pixels).clip(-limit, limit) * 2**_SHIFT).astype(np.int32)
+    seen = [True] * len(pixels) if visible is None else np.asarray(visible, dtype=bool).tolist()
     for wanted, shade in ((False, hidden_colour), (True, colour)):
         for i in range(len(pixels) - 1):
             if drawable[i] and drawable[i + 1] and (seen[i] and seen[i + 1]) == wanted:
@@ -47,9 +47,7 @@ def draw_centerline(
                 cv2.line(image, *ends, shade, width, cv2.LINE_AA, _SHIFT)
 
 
-def draw_legend(
-    image: NDArray[np.uint8], entries: list[tuple[str, tuple[int, int, int]]]
-) -> None:
+def draw_legend(image: NDArray[np.uint8], entries: list[tuple[str, tuple[int, int, int]]]) -> None:
     """Writes coloured samples with their meaning into the upper left corner, in place."""
     scale = max(image.shape[0] / 1080, 0.34)
     line = round(34 * scale)
@@ -61,8 +59,9 @@ def draw_legend(
     for row, (text, colour) in enumerate(entries):
         y = round((row + 0.75) * line)
         start, end = (line // 2, y), (line * 3 // 2, y)
-        cv2.line(image, start, end, colour, max(2, round(4 * scale)), cv2.LINE_AA)
-        origin = (2 * line, y + round(9 * scale))
+        if colour is not None:
+            cv2.line(image, start, end, colour, max(2, round(4 * scale)), cv2.LINE_AA)
+        origin = (line // 2 if colour is None else 2 * line, y + round(9 * scale))
         cv2.putText(image, text, origin, *font, (240, 240, 240), max(1, round(scale)), cv2.LINE_AA)
 
 
@@ -83,9 +82,9 @@ def draw_overlay(
         caption: first line of the legend, e.g. the view and the time.
     """
     image = view.image.copy()
-    entries: list[tuple[str, tuple[int, int, int]]] = []
+    entries: list[tuple[str, tuple[int, int, int] | None]] = []
     if caption:
-        entries.append((caption, (240, 240, 240)))
+        entries.append((caption, None))
     if goal is not None:
         draw_centerline(image, view.camera, goal, GOAL, thickness=3.0)
         entries.append(("goal", GOAL))

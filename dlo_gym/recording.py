@@ -1,9 +1,9 @@
 """Recordings on disk, format ``dlo-recording/1``: one folder with poses, images and truth.
 
-    recording.json    schema, name, rate_hz, rod, cameras
-    signals.npz       stamps, clamp_left[, clamp_right][, stamps_<camera>]
-    truth.npz         optional: centerline[, visible_<camera>]
-    views/<camera>/   000000.jpg or .png, one per sample
+recording.json    schema, name, rate_hz, rod, cameras
+signals.npz       stamps, clamp_left[, clamp_right][, stamps_<camera>]
+truth.npz         optional: centerline[, visible_<camera>]
+views/<camera>/   000000.jpg or .png, one per sample
 """
 
 import json
@@ -108,9 +108,7 @@ class Recording:
         for camera in self.cameras:
             if camera.name == name:
                 return camera
-        raise ValueError(
-            f"camera: expected one of {[c.name for c in self.cameras]}, got {name!r}"
-        )
+        raise ValueError(f"camera: expected one of {[c.name for c in self.cameras]}, got {name!r}")
 
     def view(self, camera_name: str, sample: int) -> View:
         """One image with its camera and capture time.
@@ -129,7 +127,8 @@ class Recording:
                 f" {camera_name!r} says, got {image.shape[1]}x{image.shape[0]}"
             )
         stamps = self.camera_stamps.get(camera_name, self.stamps)
-        return View(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), camera, float(stamps[sample]))
+        rgb = np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)
+        return View(rgb, camera, float(stamps[sample]))
 
     def views(self, sample: int) -> tuple[View, ...]:
         """All views of one sample, in the cameras' order."""
@@ -305,9 +304,10 @@ class RecordingWriter:
         keys = self._samples[0].keys()
         stacked = {key: np.stack([sample[key] for sample in self._samples]) for key in keys}
         truth = {k: v for k, v in stacked.items() if k == "centerline" or k.startswith("visible_")}
-        np.savez(self._folder / "signals.npz", **{k: stacked[k] for k in keys if k not in truth})
+        signals = {key: value for key, value in stacked.items() if key not in truth}
+        np.savez(self._folder / "signals.npz", allow_pickle=False, **signals)
         if truth:
-            np.savez(self._folder / "truth.npz", **truth)
+            np.savez(self._folder / "truth.npz", allow_pickle=False, **truth)
         (self._folder / "recording.json").write_text(json.dumps(self._description, indent=1))
         for folder in (self._folder / "views").iterdir():
             for file in folder.iterdir():  # images of a sample that was not completed
@@ -463,7 +463,9 @@ def _read_truth(
         key = f"visible_{camera.name}"
         if key in arrays:
             if arrays[key].dtype != bool:
-                raise RecordingError(f"{file}: expected {key!r} to be bool, got {arrays[key].dtype}")
+                raise RecordingError(
+                    f"{file}: expected {key!r} to be bool, got {arrays[key].dtype}"
+                )
             truth[key] = _array(arrays, key, (n_samples, n_nodes), file).astype(bool)
     return truth
 
@@ -476,7 +478,9 @@ def _image_files(folder: Path, n_samples: int) -> tuple[Path, ...]:
         if file.suffix.lower() not in IMAGE_SUFFIXES:
             continue
         if file.stem in files:
-            raise RecordingError(f"{file}: expected one image per sample, got {files[file.stem]} too")
+            raise RecordingError(
+                f"{file}: expected one image per sample, got {files[file.stem]} too"
+            )
         files[file.stem] = file
     wanted = [f"{sample:06d}" for sample in range(n_samples)]
     missing = [stem for stem in wanted if stem not in files]

@@ -2,15 +2,19 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from dlo_gym.geometry.camera import CameraModel
 from dlo_gym.rod.properties import RodProperties
 
-OBSERVATION_MODES = ("state", "images")
-REWARDS = ("dense", "sparse")
+CHOICES = {
+    "observation_mode": ("state", "images"),
+    "reward": ("dense", "sparse"),
+    "clutter": ("none", "industrial"),
+    "quality": ("fast", "high"),
+}
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,8 @@ class ShapeEnvConfig:
         cameras: of the scene; the scene's own ``side`` and ``top`` if empty.
         image_scale: size of the images relative to the cameras'.
         clutter: ``"none"`` or ``"industrial"``.
-        n_distractor_cables, n_occluders: in the scene; the occluders move.
+        n_distractor_cables, n_occluders: in the scene; the occluders are boxes that move.
+        occluder_size: their full extents in x, y, z [m].
         quality: of the rendering, ``"fast"`` or ``"high"``.
 
     Raises:
@@ -53,14 +58,14 @@ class ShapeEnvConfig:
 
     observer: str = "privileged"
     observer_options: Mapping[str, Any] = field(default_factory=dict)
-    observation_mode: str = "state"
+    observation_mode: Literal["state", "images"] = "state"
     properties: RodProperties = field(default_factory=lambda: RodProperties(length=0.5))
     n_elements: int = 50
     control_step: float = 0.1
     max_translation_step: float = 0.01
     max_rotation_step: float = float(np.deg2rad(4.5))
     axial_rotation: bool = False
-    reward: str = "dense"
+    reward: Literal["dense", "sparse"] = "dense"
     success_threshold: float = 0.005
     termination_penalty: float = 20.0
     start_distance: float = 0.4
@@ -70,8 +75,8 @@ class ShapeEnvConfig:
     goal_translation: float = 0.12
     goal_rotation: float = float(np.deg2rad(30.0))
     goal_distance: tuple[float, float] = (0.06, 0.25)
-    max_stretch: float = 0.97
-    min_gripper_distance: float = 0.12
+    max_stretch: float = 0.98
+    min_gripper_distance: float = 0.05
     workspace: tuple[tuple[float, float, float], tuple[float, float, float]] = (
         (-0.4, -0.25, 0.22),
         (0.4, 0.25, 0.55),
@@ -79,14 +84,18 @@ class ShapeEnvConfig:
     check_arms: bool = True
     cameras: tuple[CameraModel, ...] = ()
     image_scale: float = 0.5
-    clutter: str = "none"
+    clutter: Literal["none", "industrial"] = "none"
     n_distractor_cables: int = 0
     n_occluders: int = 0
-    quality: str = "fast"
+    occluder_size: tuple[float, float, float] = (0.12, 0.12, 0.12)
+    quality: Literal["fast", "high"] = "fast"
 
     def __post_init__(self) -> None:
-        self._check_choice("observation_mode", OBSERVATION_MODES)
-        self._check_choice("reward", REWARDS)
+        for name, choices in CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise ValueError(
+                    f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}"
+                )
         if self.observer != "privileged" and not _is_entry_point(self.observer):
             raise ValueError(
                 f"observer: expected 'privileged' or 'module:Class', got {self.observer!r}"
@@ -116,8 +125,8 @@ class ShapeEnvConfig:
             )
         if self.max_stretch >= 1.0:
             raise ValueError(f"max_stretch: expected a fraction below 1, got {self.max_stretch}")
-        low, high = np.asarray(self.workspace, dtype=np.float64).reshape(2, 3)
-        if not (low < high).all():
+        workspace = np.asarray(self.workspace, dtype=np.float64)
+        if workspace.shape != (2, 3) or not (workspace[0] < workspace[1]).all():
             raise ValueError(f"workspace: expected (lowest, highest) corners, got {self.workspace}")
         longest = self.max_stretch * self.properties.length
         if not self.min_gripper_distance < self.start_distance < longest:
@@ -152,15 +161,10 @@ class ShapeEnvConfig:
         """Whether every step needs the cameras."""
         return self.observation_mode == "images" or self.observer != "privileged"
 
-    def _check_choice(self, name: str, choices: tuple[str, ...]) -> None:
-        if getattr(self, name) not in choices:
-            raise ValueError(
-                f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}"
-            )
-
     def _check_number(self, name: str, positive: bool = False) -> None:
         value = getattr(self, name)
-        if not np.isscalar(value) or not np.isfinite(value) or value < 0 or (positive and not value):
+        number = isinstance(value, int | float | np.number) and np.isfinite(value)
+        if not number or value < 0 or (positive and value == 0):
             kind = "positive" if positive else "non-negative"
             raise ValueError(f"{name}: expected a finite {kind} number, got {value!r}")
 

@@ -1,0 +1,391 @@
+"""The closed loop: any controller on any environment through the safety gate, and its report."""
+
+import json
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import sqrt
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+import dlo_gym  # noqa: F401  (registers the environments)
+from control.controller import Controller
+from control.models import RodModel, SurrogateModel
+from control.mpc import ShapeMPC
+from control.policy import PolicyController
+from control.safety import SafetyGate, SafetyLimits
+from dlo_gym.envs.config import ShapeEnvConfig
+from dlo_gym.envs.shape_env import ShapeControlEnv
+from dlo_gym.exceptions import SafetyStop, SolverFailed
+from dlo_gym.geometry.se3 import Array
+from dlo_gym.rod.state import ShapeEstimate
+
+OBSERVERS = {"state": "privileged", "tracked": "tracking.observer:TrackerObserver"}
+# How much earlier than the environment the gate says overstretched, in lengths of the rod.
+STRETCH_RESERVE = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """The cell after one control step; the first of an episode is the start.
+
+    Attributes:
+        stamp: [s].
+        truth: (n_nodes, 3) the rod's true centerline [m].
+        goal: (n_nodes, 3) [m].
+        estimate: what the observer made of it.
+        displacement: (12,) motion of the clamps that was made, [m] and [rad], world axes.
+        shape_error: of the true rod to the goal, mean over the nodes [m].
+        tracking_ptp3d: of the estimate to the true rod, mean over the nodes [m].
+        occlusion_ratio: share of the nodes hidden, over all views.
+        success: whether ``shape_error`` is within the environment's threshold.
+        reasons: limits by which the safety gate cut the command.
+        status: of the controller.
+        termination: why the episode ended early, or "".
+        control_ms, tracking_ms: time of the controller and of the observer; None where there was
+            none.
+    """
+
+    stamp: float
+    truth: Array
+    goal: Array
+    estimate: ShapeEstimate
+    displacement: Array
+    shape_error: float
+    tracking_ptp3d: float
+    occlusion_ratio: float
+    success: bool
+    reasons: tuple[str, ...] = ()
+    status: str = "ok"
+    termination: str = ""
+    control_ms: float | None = None
+    tracking_ms: float | None = None
+
+
+def gate_for(config: ShapeEnvConfig) -> SafetyGate:
+    """A safety gate whose step limits just hold the environment's action box, and whose other
+    limits are the environment's own."""
+    return SafetyGate(
+        SafetyLimits(
+            max_translation_step=sqrt(3.0) * config.max_translation_step,
+            max_rotation_step=sqrt(3.0 if config.axial_rotation else 2.0)
+            * config.max_rotation_step,
+            control_period=config.control_step,
+            rod_length=config.properties.length,
+            overstretch_margin=1.0 - config.max_stretch + STRETCH_RESERVE,
+            min_gripper_distance=config.min_gripper_distance,
+            workspace=config.workspace,
+        )
+    )
+
+
+def run_episode(
+    env: gym.Env,
+    controller: Controller,
+    gate: SafetyGate,
+    *,
+    seed: int | None = None,
+    options: dict[str, Any] | None = None,
+    max_steps: int | None = None,
+) -> Iterator[Step]:
+    """Runs one episode, yielding its start and then every control step as it is made.
+
+    A controller that gives up or a gate that stops ends the episode with ``termination``
+    ``"solver_failed"`` or ``"safety_stop"``.
+
+    Args:
+        env: a shape-control environment, which may be wrapped.
+        controller: is reset here.
+        gate: is reset here; every command passes it.
+        seed, options: for ``env.reset``.
+        max_steps: ends the episode; the environment's own time limit when None.
+    """
+    cell_env = _shape_env(env)
+    _, info = env.reset(seed=seed, options=options)
+    goal = cell_env.goal.copy()
+    controller.reset(goal, cell_env.cell.boundary, cell_env.cell.properties)
+    gate.reset()
+    yield _step(cell_env, goal, info)
+    for _ in range(max_steps or 10**9):
+        boundary = cell_env.cell.boundary
+        started = perf_counter()
+        try:
+            command = controller.control(cell_env.estimate, boundary, goal)
+            control_ms = 1e3 * (perf_counter() - started)
+            decision = gate.check(command, boundary)
+        except (SolverFailed, SafetyStop) as error:
+            name = "solver_failed" if isinstance(error, SolverFailed) else "safety_stop"
+            still = info | {"displacement": np.zeros(12), "termination": name}
+            yield _step(cell_env, goal, still, status=str(error))
+            return
+        action = cell_env.displacement_to_action(decision.displacement)
+        _, _, terminated, truncated, info = env.step(action)
+        yield _step(
+            cell_env,
+            goal,
+            info,
+            reasons=decision.reasons,
+            status=controller.diagnostics.status,
+            control_ms=control_ms,
+            tracking_ms=cell_env.estimate.timings_ms.get("total"),
+        )
+        if terminated or truncated:
+            return
+
+
+def _step(env: ShapeControlEnv, goal: Array, info: dict[str, Any], **of_command: Any) -> Step:
+    return Step(
+        stamp=env.cell.stamp,
+        truth=env.cell.rod_state.positions.copy(),
+        goal=goal,
+        estimate=env.estimate,
+        displacement=np.array(info["displacement"]),
+        shape_error=info["shape_error"],
+        tracking_ptp3d=info["tracking_ptp3d"],
+        occlusion_ratio=info["occlusion_ratio"],
+        success=info["success"],
+        termination=info["termination"],
+        **of_command,
+    )
+
+
+def episode_metrics(steps: Sequence[Step]) -> dict[str, Any]:
+    """What is reported of one episode; lengths in mm, times in ms."""
+    errors = [step.shape_error for step in steps]
+    reached = [i for i, step in enumerate(steps) if step.success]
+    return {
+        "initial_shape_error_mm": 1e3 * errors[0],
+        "final_shape_error_mm": 1e3 * errors[-1],
+        "smallest_shape_error_mm": 1e3 * min(errors),
+        "tracking_ptp3d_mm": 1e3 * _mean([step.tracking_ptp3d for step in steps]),
+        "occlusion_percent": 100.0 * _mean([step.occlusion_ratio for step in steps]),
+        "success": bool(steps[-1].success and not steps[-1].termination),
+        "steps": len(steps) - 1,
+        "steps_to_success": reached[0] if reached else None,
+        "termination": steps[-1].termination,
+        "control_ms": _times([step.control_ms for step in steps]),
+        "tracking_ms": _times([step.tracking_ms for step in steps]),
+        "held_still": sum(step.status != "ok" for step in steps),
+        "safety_cuts": dict(Counter(reason for step in steps for reason in step.reasons)),
+    }
+
+
+def overall_metrics(episodes: Sequence[Sequence[Step]]) -> dict[str, Any]:
+    """Means over episodes, times over all steps, and every episode's own metrics.
+
+    ``success`` is true if every episode succeeded; ``success_rate`` is the share that did.
+    """
+    each = [episode_metrics(steps) for steps in episodes]
+    every_step = [step for steps in episodes for step in steps]
+    means = {
+        name: _mean([episode[name] for episode in each])
+        for name in (
+            "initial_shape_error_mm",
+            "final_shape_error_mm",
+            "tracking_ptp3d_mm",
+            "occlusion_percent",
+        )
+    }
+    return means | {
+        "worst_final_shape_error_mm": max(episode["final_shape_error_mm"] for episode in each),
+        "success": all(episode["success"] for episode in each),
+        "success_rate": _mean([episode["success"] for episode in each]),
+        "control_ms": _times([step.control_ms for step in every_step]),
+        "tracking_ms": _times([step.tracking_ms for step in every_step]),
+        "episodes": each,
+    }
+
+
+def control(
+    *,
+    controller: Literal["mpc", "rl"] = "mpc",
+    env: str = "dlo_gym/ShapeControl-v0",
+    observer: Literal["state", "tracked"] | None = None,
+    model: Literal["surrogate", "rod"] = "surrogate",
+    episodes: int = 5,
+    seed: int = 0,
+    max_steps: int | None = None,
+    policy: Path | None = None,
+    out: Path = Path("out/control"),
+    overwrite: bool = False,
+) -> None:
+    """Run a controller on an environment, every command through the safety gate, and report.
+
+    Prints a table with one row per episode and writes metrics.json, which is kept up to date
+    after every episode, so that an interrupted run loses nothing that was finished.
+
+    Args:
+        controller: mpc, or rl for a trained policy.
+        env: id of a shape-control environment.
+        observer: state for the simulator's own state, tracked for the tracker on rendered views;
+            what the environment id says when omitted.
+        model: what the MPC plans on: the trained surrogate, or the rod itself.
+        episodes: how many.
+        seed: of the first episode; each next one takes the next seed.
+        max_steps: per episode; the environment's time limit when omitted.
+        policy: file of the trained policy, for rl.
+        out: folder for metrics.json.
+        overwrite: write into ``out`` even if it exists.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes: expected at least 1, got {episodes}")
+    if max_steps is not None and max_steps < 1:
+        raise ValueError(f"max_steps: expected at least 1, got {max_steps}")
+    if out.exists() and not overwrite:
+        raise FileExistsError(f"{out} exists; pass --overwrite to write into it")
+    finished: list[list[Step]] = []
+    environment = make_env(env, observer)
+    try:
+        config = _shape_env(environment).config
+        gate = gate_for(config)
+        driver = make_controller(controller, gate.limits, config, model=model, policy=policy)
+        out.mkdir(parents=True, exist_ok=True)
+        settings = {"controller": controller, "env": env, "observer": config.observer, "seed": seed}
+        if controller == "mpc":
+            settings["model"] = model
+        console = Console()
+        with Progress(console=console, transient=True) as progress:
+            task = progress.add_task("episodes", total=episodes)
+            for index in range(episodes):
+                steps = []
+                for step in run_episode(
+                    environment, driver, gate, seed=seed + index, max_steps=max_steps
+                ):
+                    steps.append(step)
+                    error = f"episode {index}: {1e3 * step.shape_error:6.2f} mm"
+                    progress.update(task, description=error)
+                finished.append(steps)
+                progress.advance(task)
+                write_metrics(out / "metrics.json", settings | overall_metrics(finished))
+    finally:
+        environment.close()
+        if not finished and out.is_dir() and not any(out.iterdir()):
+            out.rmdir()
+    console.print(_table(overall_metrics(finished), seed))
+    console.print(f"written: {out / 'metrics.json'}", highlight=False)
+
+
+def make_env(name: str, observer: str | None = None, **options: Any) -> gym.Env:
+    """The environment ``name``, observing as ``observer`` says (``"state"``, ``"tracked"``).
+
+    Raises:
+        ValueError: if there is no such environment or observer, or it takes no such option.
+    """
+    if observer is not None:
+        if observer not in OBSERVERS:
+            raise ValueError(f"observer: expected one of {', '.join(OBSERVERS)}, got {observer!r}")
+        options["observer"] = OBSERVERS[observer]
+    try:
+        return gym.make(name, **options)
+    except (gym.error.Error, ModuleNotFoundError) as error:
+        shipped = [known for known in gym.registry if known.startswith("dlo_gym/")]
+        raise ValueError(
+            f"env: cannot make {name!r}: {error}; this package has {', '.join(shipped)}"
+        ) from error
+
+
+def make_controller(
+    name: str,
+    limits: SafetyLimits,
+    config: ShapeEnvConfig,
+    *,
+    model: str = "surrogate",
+    policy: Path | None = None,
+) -> Controller:
+    """The controller ``name``: ``"mpc"`` on ``model``, or ``"rl"`` with the file ``policy``.
+
+    Raises:
+        ValueError: on an unknown name, or if ``rl`` comes without a policy.
+        WeightsError: if the weights of the surrogate or the policy are missing or damaged.
+    """
+    if name == "mpc":
+        if model == "rod":
+            return ShapeMPC(RodModel(config.n_elements), limits)
+        from dlo_gym.surrogate.predictor import ShapePredictor
+
+        return ShapeMPC(SurrogateModel(ShapePredictor.load()), limits)
+    if name == "rl":
+        if policy is None:
+            raise ValueError("policy: the rl controller needs the file of a trained policy")
+        return PolicyController(policy)
+    raise ValueError(f"controller: expected mpc or rl, got {name!r}")
+
+
+def write_metrics(path: Path, metrics: dict[str, Any]) -> None:
+    """Write JSON so that the file is always whole; NaN becomes null."""
+    partial = path.with_name(path.name + ".part")
+    partial.write_text(json.dumps(_without_nan(metrics), indent=2) + "\n")
+    os.replace(partial, path)
+
+
+def _shape_env(env: gym.Env) -> ShapeControlEnv:
+    inner = env.unwrapped
+    if not isinstance(inner, ShapeControlEnv):
+        raise ValueError(f"env: expected a shape-control environment, got {type(inner).__name__}")
+    return inner
+
+
+def _table(metrics: dict[str, Any], seed: int) -> Table:
+    table = Table(
+        title="mean node errors of the true rod and of the tracker in mm, median (p99) times in ms",
+        box=box.SIMPLE_HEAD,
+        padding=0,
+        collapse_padding=True,
+    )
+    for name in ("seed", "start", "end", "tracker", "hidden", "steps", "to goal"):
+        table.add_column(name, justify="right")
+    for name in ("control", "tracking"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("result")
+    for index, episode in enumerate(metrics["episodes"]):
+        result = "reached" if episode["success"] else (episode["termination"] or "not reached")
+        to_goal = episode["steps_to_success"]
+        numbers = [str(episode["steps"]), "-" if to_goal is None else str(to_goal)]
+        table.add_row(str(seed + index), *_columns(episode, numbers), result)
+    share = f"{100 * metrics['success_rate']:.0f} %"
+    table.add_section()
+    table.add_row("all", *_columns(metrics, ["", ""]), share)
+    return table
+
+
+def _columns(metrics: dict[str, Any], counts: list[str]) -> list[str]:
+    return [
+        f"{metrics['initial_shape_error_mm']:.1f}",
+        f"{metrics['final_shape_error_mm']:.2f}",
+        f"{metrics['tracking_ptp3d_mm']:.2f}",
+        f"{metrics['occlusion_percent']:.0f} %",
+        *counts,
+        *[_median_and_p99(metrics[name]) for name in ("control_ms", "tracking_ms")],
+    ]
+
+
+def _median_and_p99(times: dict[str, float] | None) -> str:
+    return "-" if times is None else f"{times['median']:.1f} ({times['p99']:.1f})"
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values))
+
+
+def _times(values: Sequence[float | None]) -> dict[str, float] | None:
+    known = [value for value in values if value is not None]
+    if not known:
+        return None
+    return {"median": float(np.median(known)), "p99": float(np.percentile(known, 99))}
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value

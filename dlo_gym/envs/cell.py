@@ -1,0 +1,222 @@
+"""The simulated work cell: a rod between two arms, cameras, moving occluders and a clock."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_gym.geometry.camera import CameraModel, View
+from dlo_gym.geometry.se3 import Array
+from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
+from dlo_gym.rod.properties import RodProperties
+from dlo_gym.rod.rod import CosseratRod
+from dlo_gym.rod.state import RodState
+from dlo_gym.scene.builder import SceneConfig
+from dlo_gym.scene.renderer import SceneRenderer
+
+
+@dataclass(frozen=True, eq=False)
+class OccluderPath:
+    """A body that swings to and fro.
+
+    Attributes:
+        centre: (3,) middle of the path, world [m].
+        swing: (3,) from the middle to one end [m].
+        period: of one swing to and fro [s].
+        phase: at time zero [rad].
+    """
+
+    centre: Array
+    swing: Array
+    period: float
+    phase: float
+
+    def position(self, stamp: float) -> Array:
+        """(3,) where the body is at time ``stamp`` [s]."""
+        return self.centre + self.swing * np.sin(2.0 * np.pi * stamp / self.period + self.phase)
+
+
+@dataclass(frozen=True, eq=False)
+class CellState:
+    """What a cell returns to: the rod, the arms' joint angles (2, 6) [rad], the time [s]."""
+
+    rod: RodState
+    joint_angles: Array | None
+    stamp: float
+
+
+class SimulatedCell:
+    """A rod held by two arms in front of cameras.
+
+    The renderer is built when the first image is asked for, so a cell that is never looked at
+    needs no OpenGL.
+
+    Args:
+        properties: of the rod.
+        n_elements: of the rod.
+        scene: what the cameras see.
+        check_arms: whether every clamp pose must be in the arms' reach.
+        control_step: how far the clock goes on with every move [s].
+    """
+
+    def __init__(
+        self,
+        properties: RodProperties,
+        n_elements: int = 50,
+        *,
+        scene: SceneConfig,
+        check_arms: bool = True,
+        control_step: float = 0.1,
+    ) -> None:
+        self.rod = CosseratRod(properties, n_elements)
+        self.scene = scene
+        self.arms = scene.arms if check_arms else None
+        self.control_step = control_step
+        self.stamp = 0.0
+        self.joint_angles: Array | None = None
+        self._occluders: tuple[OccluderPath, ...] = ()
+        self._rod_state: RodState | None = None
+        self._renderer: SceneRenderer | None = None
+        self._posed = False
+        self._views: tuple[View, ...] | None = None
+        self._visibility: NDArray[np.bool_] | None = None
+
+    @property
+    def properties(self) -> RodProperties:
+        return self.rod.properties
+
+    @property
+    def cameras(self) -> tuple[CameraModel, ...]:
+        return tuple(self.scene.cameras)
+
+    @property
+    def rod_state(self) -> RodState:
+        """The true state of the rod."""
+        if self._rod_state is None:
+            raise ValueError("the cell holds no rod yet; call reset(boundary) first")
+        return self._rod_state
+
+    @property
+    def boundary(self) -> BoundaryPoses:
+        """The clamp poses that hold the rod."""
+        return self.rod_state.boundary
+
+    def reset(self, boundary: BoundaryPoses, occluders: Sequence[OccluderPath] = ()) -> RodState:
+        """Settle the rod between ``boundary`` and set the clock to zero.
+
+        Raises:
+            ValueError: if the clamps are too far apart, or there is another number of occluders
+                than in the scene.
+            UnreachablePose: if an arm cannot hold its clamp there.
+            RodDiverged: if the rod finds no equilibrium.
+        """
+        if len(occluders) != self.scene.n_occluders:
+            raise ValueError(
+                f"occluders: expected the path of each of {self.scene.n_occluders},"
+                f" got {len(occluders)}"
+            )
+        joint_angles = self._reach(boundary, None)
+        self._rod_state = self.rod.settle(boundary)
+        self.joint_angles = joint_angles
+        self._occluders = tuple(occluders)
+        self._show(0.0)
+        return self._rod_state
+
+    def move(self, displacement: BoundaryDisplacement) -> RodState:
+        """Move the clamps, let the rod follow and the clock go on.
+
+        Nothing has changed if this raises.
+
+        Raises:
+            ValueError: if the clamps would be further apart than the rod is long.
+            UnreachablePose: if an arm cannot follow.
+            RodDiverged: if the rod's equilibrium was lost.
+        """
+        joint_angles = self._reach(self.boundary.displaced(displacement), self.joint_angles)
+        self._rod_state = self.rod.move(displacement)
+        self.joint_angles = joint_angles
+        self._show(self.stamp + self.control_step)
+        return self._rod_state
+
+    def save(self) -> CellState:
+        return CellState(self.rod_state, self.joint_angles, self.stamp)
+
+    def restore(self, state: CellState) -> None:
+        """Return to a saved state exactly."""
+        self.rod.restore(state.rod)
+        self._rod_state = state.rod
+        self.joint_angles = state.joint_angles
+        self._show(state.stamp)
+
+    def arms_in_collision(self) -> bool:
+        """Whether an arm or gripper touches the other arm, itself or the table."""
+        if self.arms is None or self.joint_angles is None:
+            return False
+        return self.arms.clearance(self.joint_angles).minimum < 0.0
+
+    def views(self) -> tuple[View, ...]:
+        """One image per camera of the cell as it is now."""
+        if self._views is None:
+            self._views = self._posed_renderer().views(self.stamp)
+        return self._views
+
+    def visibility(self) -> NDArray[np.bool_]:
+        """(n_views, n_nodes) which nodes each camera truly sees, hidden by nothing."""
+        if self._visibility is None:
+            renderer = self._posed_renderer()
+            self._visibility = np.array(
+                [renderer.visibility(camera.name) for camera in self.cameras]
+            )
+        return self._visibility
+
+    def close(self) -> None:
+        """Give back the renderer; the cell builds another one when it is looked at again."""
+        if self._renderer is not None:
+            self._renderer.close()
+        self._renderer = None
+        self._posed = False
+
+    def _reach(self, boundary: BoundaryPoses, guess: Array | None) -> Array | None:
+        return None if self.arms is None else self.arms.inverse_kinematics(boundary, guess)
+
+    def _show(self, stamp: float) -> None:
+        self.stamp = stamp
+        self._posed = False
+        self._views = self._visibility = None
+
+    def _posed_renderer(self) -> SceneRenderer:
+        if self._renderer is None:
+            self._renderer = SceneRenderer(self.scene)
+        if not self._posed:
+            state = self.rod_state
+            occluders = np.array([path.position(self.stamp) for path in self._occluders])
+            self._renderer.update(
+                state.positions,
+                state.boundary,
+                occluder_positions=occluders if len(occluders) else None,
+                joint_angles=self.joint_angles,
+            )
+            self._posed = True
+        return self._renderer
+
+
+def sample_occluder_paths(
+    rng: np.random.Generator, cameras: Sequence[CameraModel], n_occluders: int
+) -> tuple[OccluderPath, ...]:
+    """Paths across the lines of sight of the cameras, in turn, to the middle of the cell."""
+    paths = []
+    for index in range(n_occluders):
+        camera = cameras[index % len(cameras)]
+        target = np.array([rng.uniform(-0.12, 0.12), 0.0, 0.3])
+        centre = camera.centre + rng.uniform(0.5, 0.65) * (target - camera.centre)
+        across = camera.T_world_camera[:3, 0] * rng.choice([-1.0, 1.0])
+        paths.append(
+            OccluderPath(
+                centre=centre,
+                swing=rng.uniform(0.12, 0.2) * across,
+                period=float(rng.uniform(6.0, 10.0)),
+                phase=float(rng.uniform(0.0, 2.0 * np.pi)),
+            )
+        )
+    return tuple(paths)

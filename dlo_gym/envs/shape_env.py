@@ -1,0 +1,314 @@
+"""The shape-control environment."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from dlo_gym.envs import tasks
+from dlo_gym.envs.actions import ClampAction, clamp_numbers
+from dlo_gym.envs.cell import SimulatedCell, sample_occluder_paths
+from dlo_gym.envs.config import ShapeEnvConfig
+from dlo_gym.envs.observers import make_observer
+from dlo_gym.exceptions import TrackLost
+from dlo_gym.geometry.se3 import Array
+from dlo_gym.metrics import occlusion_ratio, ptp_3d
+from dlo_gym.overlay import draw_overlay
+from dlo_gym.rod.boundary import BoundaryDisplacement
+from dlo_gym.rod.state import ShapeEstimate
+from dlo_gym.scene.builder import SceneConfig, default_cameras
+
+RESET_OPTIONS = ("start", "goal")
+
+
+class ShapeControlEnv(gym.Env):
+    """Two arms hold the ends of a cable and bring it into a goal shape.
+
+    ## Description
+    The cable is an elastic rod (bending, twist, shear, stretch, weight) in quasi-static
+    equilibrium between two clamps. Both arms move their clamp a little in every step; the whole
+    centerline shall come to lie on the goal's. `dlo_gym/ShapeControl-v0` observes the simulator's
+    own state, `dlo_gym/ShapeControlTracked-v0` renders two views in every step and observes the
+    cable through the multi-view tracker.
+
+    ## Action Space
+    A `Box(-1, 1, (10,), float32)`, or `(12,)` with `axial_rotation=True`. Larger values are
+    clipped; NaN and wrong shapes raise `ValueError`.
+
+    | Num | Action                                   | Full scale                     |
+    | --- | ---------------------------------------- | ------------------------------ |
+    | 0-2 | left clamp: translation along world x y z | `max_translation_step` 0.01 m |
+    | 3-4 | left clamp: rotation about its d1, d2    | `max_rotation_step` 4.5 deg    |
+    | 5-7 | right clamp: translation                 | as left                        |
+    | 8-9 | right clamp: rotation about its d1, d2   | as left                        |
+
+    With `axial_rotation` each clamp has one more number, the rotation about d3 (the cable's axis).
+
+    ## Observation Space
+    A flat `Dict` of float32 arrays, with n = 51 nodes:
+
+    | Key              | Shape       | Meaning                                                   |
+    | ---------------- | ----------- | --------------------------------------------------------- |
+    | `observation`    | (3 n + 18,) | estimated centerline [m]; then of the left and the right  |
+    |                  |             | clamp the position [m], d1 and d3                         |
+    | `achieved_goal`  | (3 n,)      | estimated centerline, world [m], node 0 at the left clamp |
+    | `desired_goal`   | (3 n,)      | goal centerline, world [m]                                |
+    | `image_<camera>` | (h, w, 3)   | uint8 RGB; only with `observation_mode="images"`          |
+
+    ## Rewards
+    With `reward="dense"` minus the mean node distance of achieved to desired goal in decimetres;
+    with `reward="sparse"` 0 if that distance is at most `success_threshold`, else -1. The step
+    that ends an episode early costs `termination_penalty` on top. `compute_reward(achieved_goal,
+    desired_goal, info)` takes single values or batches with a sequence of infos.
+
+    ## Info
+    | Key                           | Meaning                                                   |
+    | ----------------------------- | --------------------------------------------------------- |
+    | `success`, `is_success`       | whether `shape_error <= success_threshold`                |
+    | `shape_error`                 | mean node distance of the true rod to the goal [m]        |
+    | `tracking_ptp3d`              | mean node distance of the estimate to the true rod [m]    |
+    | `occlusion_ratio`             | share of nodes truly hidden, over all views; 0 if the     |
+    |                               | environment uses no images                                |
+    | `wrench_left`, `wrench_right` | (6,) force [N] and torque [N m] of each clamp on the rod, |
+    |                               | world axes                                                |
+    | `displacement`                | (12,) how the clamps really moved [m, rad], world axes    |
+    | `termination`                 | why the episode ended early, or `""`                      |
+
+    ## Starting State
+    The clamps are about 0.4 m apart and 0.34 m above the table, moved and tilted at random within
+    `start_noise`. The goal is the shape that the cable takes after `goal_moves` random motions
+    from there, every step of which this environment allows: it can be reached, but it was reached
+    on another than the straight way. `reset(options={"start": BoundaryPoses, "goal": centerline})`
+    sets either.
+
+    ## Episode End
+    Truncation after 100 steps (`gym.make(..., max_episode_steps=...)`). Termination, with the
+    reason in `info["termination"]`; a motion that cannot be made leaves the cable where it was:
+
+    | Reason          | Meaning                                                          |
+    | --------------- | ---------------------------------------------------------------- |
+    | `overstretch`   | the clamps would be further apart than `max_stretch` rod lengths |
+    | `collision`     | the grippers or arms touch each other or the table               |
+    | `unreachable`   | an arm cannot take its clamp pose                                |
+    | `table_contact` | the cable touches the table                                      |
+    | `rod_diverged`  | no equilibrium of the rod was found                              |
+    | `track_lost`    | the observer has not seen the cable for too long                 |
+
+    Success does not end an episode.
+
+    ## Arguments
+    Every field of `ShapeEnvConfig`, e.g.
+    `gym.make("dlo_gym/ShapeControl-v0", goal_distance=(0.06, 0.1), reward="sparse")`.
+
+    ## Version History
+    * v0: first version.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(self, render_mode: str | None = None, **options: Any) -> None:
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(
+                f"render_mode: expected None or one of {self.metadata['render_modes']},"
+                f" got {render_mode!r}"
+            )
+        self.config = config = ShapeEnvConfig.from_options(options)
+        self.render_mode = render_mode
+        self.metadata = self.metadata | {"render_fps": round(1.0 / config.control_step)}
+        self.cell = SimulatedCell(
+            config.properties,
+            config.n_elements,
+            scene=_scene_config(config),
+            check_arms=config.check_arms,
+            control_step=config.control_step,
+        )
+        self._observer = make_observer(config.observer, config.observer_options)
+        self._estimate: ShapeEstimate | None = None
+        self._goal: Array | None = None
+        self.clamp_action = ClampAction(
+            config.max_translation_step, config.max_rotation_step, config.axial_rotation
+        )
+        self.action_space = spaces.Box(-1.0, 1.0, (self.clamp_action.size,), np.float32)
+        self.observation_space = self._make_observation_space()
+
+    @property
+    def estimate(self) -> ShapeEstimate:
+        """What the observer knows of the rod's shape since the last step."""
+        if self._estimate is None:
+            raise gym.error.ResetNeeded("no estimate yet; call reset() first")
+        return self._estimate
+
+    @property
+    def goal(self) -> Array:
+        """(n_nodes, 3) goal centerline, world [m]."""
+        if self._goal is None:
+            raise gym.error.ResetNeeded("no goal yet; call reset() first")
+        return self._goal
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, NDArray], dict[str, Any]]:
+        super().reset(seed=seed)
+        options = options or {}
+        unknown = [name for name in options if name not in RESET_OPTIONS]
+        if unknown:
+            raise ValueError(
+                f"unknown reset option {', '.join(map(repr, unknown))};"
+                f" valid options are: {', '.join(RESET_OPTIONS)}"
+            )
+        config, rng = self.config, self.np_random
+        occluders = sample_occluder_paths(rng, self.cell.cameras, config.n_occluders)
+        if "start" in options:
+            self.cell.reset(options["start"], occluders)
+        else:
+            tasks.reset_to_random_start(self.cell, rng, config, occluders)
+        if "goal" in options:
+            self._goal = _check_goal(options["goal"], config.n_nodes)
+        else:
+            self._goal = tasks.sample_goal(self.cell, rng, config).centerline
+        self._estimate = self._observer.reset(self.cell)
+        return self._observation(), self._info(BoundaryDisplacement.zero(), "")
+
+    def step(
+        self, action: ArrayLike
+    ) -> tuple[dict[str, NDArray], float, bool, bool, dict[str, Any]]:
+        if self._estimate is None:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        displacement = self.action_to_displacement(action)
+        before = self.cell.boundary
+        termination = tasks.advance(self.cell, displacement, self.config)
+        if self.cell.boundary is before:  # refused
+            displacement = BoundaryDisplacement.zero()
+        try:
+            self._estimate = self._observer.update(self.cell, displacement)
+        except TrackLost:
+            termination = termination or "track_lost"
+        observation = self._observation()
+        info = self._info(displacement, termination)
+        reward = self.compute_reward(
+            observation["achieved_goal"], observation["desired_goal"], info
+        )
+        return observation, float(reward), bool(termination), False, info
+
+    def compute_reward(
+        self,
+        achieved_goal: ArrayLike,
+        desired_goal: ArrayLike,
+        info: dict[str, Any] | Sequence[dict[str, Any]],
+    ) -> Any:
+        """Reward of flat centerlines (3 n,) or (batch, 3 n) [m]: a number, or (batch,)."""
+        return tasks.compute_reward(
+            achieved_goal,
+            desired_goal,
+            tasks.failures(info),
+            kind=self.config.reward,
+            success_threshold=self.config.success_threshold,
+            termination_penalty=self.config.termination_penalty,
+        )
+
+    def action_to_displacement(self, action: ArrayLike) -> BoundaryDisplacement:
+        """The motion of the clamps, world axes, that ``action`` (10,) or (12,) stands for."""
+        return self.clamp_action.to_displacement(action, self.cell.boundary)
+
+    def displacement_to_action(self, displacement: BoundaryDisplacement) -> NDArray[np.float32]:
+        """The action closest to ``displacement`` within the step limits."""
+        action = self.clamp_action.to_action(displacement, self.cell.boundary)
+        return action.astype(np.float32)
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """All views side by side, with goal and estimate drawn in, or None without render mode."""
+        if self.render_mode is None:
+            gym.logger.warn(
+                "render() was called without a render mode; pass render_mode='rgb_array' to make"
+            )
+            return None
+        estimate = self.estimate
+        images = []
+        for index, view in enumerate(self.cell.views()):
+            visible = estimate.visible[index] if len(estimate.visible) else None
+            images.append(
+                draw_overlay(
+                    view,
+                    estimate.centerline if visible is not None else None,
+                    visible=visible,
+                    goal=self.goal,
+                    caption=f"{view.camera.name}  {self.cell.stamp:.1f} s",
+                )
+            )
+        height = min(len(image) for image in images)
+        return np.hstack([image[:height] for image in images])
+
+    def close(self) -> None:
+        self._observer.close()
+        self.cell.close()
+
+    def _make_observation_space(self) -> spaces.Dict:
+        n_nodes = self.config.n_nodes
+        # No point of a cable in reach of the arms is further than 2 m from the origin.
+        entries: dict[str, spaces.Space] = {
+            "observation": spaces.Box(-2.0, 2.0, (3 * n_nodes + 18,), np.float32),
+            "achieved_goal": spaces.Box(-2.0, 2.0, (3 * n_nodes,), np.float32),
+            "desired_goal": spaces.Box(-2.0, 2.0, (3 * n_nodes,), np.float32),
+        }
+        if self.config.observation_mode == "images":
+            for camera in self.cell.cameras:
+                shape = (camera.height, camera.width, 3)
+                entries[f"image_{camera.name}"] = spaces.Box(0, 255, shape, np.uint8)
+        return spaces.Dict(entries)
+
+    def _observation(self) -> dict[str, NDArray]:
+        centerline = self.estimate.centerline.ravel()
+        boundary = self.cell.boundary
+        clamps = [clamp_numbers(clamp) for clamp in (boundary.left, boundary.right)]
+        observation: dict[str, NDArray] = {
+            "observation": np.concatenate([centerline, *clamps]).astype(np.float32),
+            "achieved_goal": centerline.astype(np.float32),
+            "desired_goal": self.goal.ravel().astype(np.float32),
+        }
+        if self.config.observation_mode == "images":
+            for view in self.cell.views():
+                observation[f"image_{view.camera.name}"] = view.image.copy()
+        return observation
+
+    def _info(self, displacement: BoundaryDisplacement, termination: str) -> dict[str, Any]:
+        state = self.cell.rod_state
+        error = float(tasks.shape_error(state.positions, self.goal))
+        success = error <= self.config.success_threshold
+        hidden = occlusion_ratio(self.cell.visibility()) if self.config.uses_images else 0.0
+        return {
+            "success": success,
+            "is_success": success,
+            "shape_error": error,
+            "tracking_ptp3d": float(ptp_3d(self.estimate.centerline, state.positions).mean()),
+            "occlusion_ratio": hidden,
+            "wrench_left": state.wrench_left.copy(),
+            "wrench_right": state.wrench_right.copy(),
+            "displacement": displacement.vector,
+            "termination": termination,
+        }
+
+
+def _check_goal(goal: ArrayLike, n_nodes: int) -> Array:
+    goal = np.array(goal, dtype=np.float64)
+    if goal.shape != (n_nodes, 3) or not np.isfinite(goal).all():
+        raise ValueError(
+            f"goal: expected a finite centerline of shape ({n_nodes}, 3), got shape {goal.shape}"
+        )
+    return goal
+
+
+def _scene_config(config: ShapeEnvConfig) -> SceneConfig:
+    cameras = config.cameras or default_cameras()
+    return SceneConfig(
+        cameras=tuple(camera.scaled(config.image_scale) for camera in cameras),
+        rod_radius=float(np.max(config.properties.radius)),
+        n_nodes=config.n_nodes,
+        clutter=config.clutter,
+        n_distractor_cables=config.n_distractor_cables,
+        n_occluders=config.n_occluders,
+        occluder_size=config.occluder_size,
+        quality=config.quality,
+    )

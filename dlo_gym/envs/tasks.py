@@ -1,0 +1,203 @@
+"""The task: where the rod starts, which shape it shall take, what is progress and what failure."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dlo_gym.envs.cell import OccluderPath, SimulatedCell
+from dlo_gym.envs.config import ShapeEnvConfig
+from dlo_gym.exceptions import RodDiverged, UnreachablePose
+from dlo_gym.geometry.se3 import Array, exp_so3, pose
+from dlo_gym.metrics import ptp_3d
+from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
+
+DENSE_UNIT = 0.1  # mean node error that costs 1 per step [m]
+ATTEMPTS = 200
+GOAL_STRETCH = 0.95  # of the largest distance between the clamps, at the goal
+
+
+@dataclass(frozen=True, eq=False)
+class Goal:
+    """A shape to reach.
+
+    Attributes:
+        centerline: (n_nodes, 3) world [m].
+        boundary: the clamp poses that held the rod in it when it was sampled.
+    """
+
+    centerline: Array
+    boundary: BoundaryPoses
+
+
+def shape_error(achieved: ArrayLike, desired: ArrayLike) -> Array:
+    """Mean node distance (...) [m] of centerlines (..., n, 3), or flat (..., 3 n) [m]."""
+    achieved = np.asarray(achieved, dtype=np.float64)
+    desired = np.asarray(desired, dtype=np.float64)
+    if achieved.shape != desired.shape or achieved.size % 3:
+        raise ValueError(
+            "achieved, desired: expected centerlines of one shape,"
+            f" got {achieved.shape} and {desired.shape}"
+        )
+    if achieved.shape[-1] != 3:
+        points = (*achieved.shape[:-1], achieved.shape[-1] // 3, 3)
+        achieved, desired = achieved.reshape(points), desired.reshape(points)
+    return ptp_3d(achieved, desired).mean(axis=-1)
+
+
+def compute_reward(
+    achieved: ArrayLike,
+    desired: ArrayLike,
+    failed: ArrayLike,
+    *,
+    kind: str,
+    success_threshold: float,
+    termination_penalty: float,
+) -> Array:
+    """Reward (...) of reaching flat centerlines ``achieved`` for ``desired`` (..., 3 n) [m].
+
+    Args:
+        failed: (...) whether the episode ended early at this step.
+        kind: ``"dense"``: minus the mean node error in decimetres; ``"sparse"``: 0 if that error
+            is at most ``success_threshold`` [m], else -1.
+        termination_penalty: taken off where ``failed``.
+    """
+    error = shape_error(achieved, desired)
+    cost = error / DENSE_UNIT if kind == "dense" else (error > success_threshold).astype(float)
+    return -cost - termination_penalty * np.asarray(failed, dtype=np.float64)
+
+
+def failures(infos: dict[str, Any] | Sequence[dict[str, Any]]) -> NDArray[np.bool_]:
+    """Whether each info, or the only one, tells of an episode that ended early."""
+    if isinstance(infos, dict):
+        return np.array(bool(infos.get("termination")))
+    return np.array([bool(info.get("termination")) for info in infos], dtype=bool)
+
+
+def advance(cell: SimulatedCell, displacement: BoundaryDisplacement, config: ShapeEnvConfig) -> str:
+    """Move the cell by one step; the reason why that ends the episode, or ``""``.
+
+    A motion that cannot be made leaves the cell as it was.
+    """
+    distance = _distance_after(cell.boundary, displacement)
+    # A command that the safety gate cut to a limit stands on it up to rounding.
+    if distance > config.max_stretch * config.properties.length + 1e-9:
+        return "overstretch"
+    if distance < config.min_gripper_distance - 1e-9:
+        return "collision"
+    try:
+        state = cell.move(displacement)
+    except UnreachablePose:
+        return "unreachable"
+    except RodDiverged:
+        return "rod_diverged"
+    if cell.arms_in_collision():
+        return "collision"
+    if state.positions[:, 2].min() < np.max(config.properties.radius):
+        return "table_contact"
+    return ""
+
+
+def reset_to_random_start(
+    cell: SimulatedCell,
+    rng: np.random.Generator,
+    config: ShapeEnvConfig,
+    occluders: tuple[OccluderPath, ...],
+) -> None:
+    """Settle the cell's rod between random clamps around the middle of the start distribution.
+
+    Raises:
+        ValueError: if the options leave no start that the arms and the rod can take.
+    """
+    for _ in range(ATTEMPTS):
+        try:
+            cell.reset(_random_start(rng, config), occluders)
+        except (UnreachablePose, RodDiverged, ValueError):
+            continue
+        if advance(cell, BoundaryDisplacement.zero(), config) == "":
+            cell.reset(cell.boundary, occluders)
+            return
+    raise ValueError(
+        f"no start found in {ATTEMPTS} attempts for start_distance={config.start_distance},"
+        f" start_height={config.start_height}, start_noise={config.start_noise}"
+    )
+
+
+def sample_goal(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvConfig) -> Goal:
+    """A shape that the rod takes after a random sequence of motions from its present state.
+
+    Every step on the way is one that the environment would allow, so the goal can be reached; the
+    way leads over intermediate poses, so it is not the straight one. The cell is left as it was.
+
+    Raises:
+        ValueError: if the options leave no goal that can be reached.
+    """
+    start = cell.save()
+    try:
+        for _ in range(ATTEMPTS):
+            cell.restore(start)
+            if not _wander(cell, start.rod.boundary, rng, config):
+                continue
+            goal = Goal(cell.rod_state.positions.copy(), cell.boundary)
+            distance = shape_error(goal.centerline, start.rod.positions)
+            stretch = goal.boundary.distance / (config.max_stretch * config.properties.length)
+            near, far = config.goal_distance
+            if near <= distance <= far and stretch <= GOAL_STRETCH:
+                return goal
+    finally:
+        cell.restore(start)
+    raise ValueError(
+        f"no goal found in {ATTEMPTS} attempts for goal_distance={config.goal_distance} [m],"
+        f" goal_moves={config.goal_moves}, goal_translation={config.goal_translation} [m],"
+        f" goal_rotation={config.goal_rotation} [rad]"
+    )
+
+
+def _distance_after(boundary: BoundaryPoses, displacement: BoundaryDisplacement) -> float:
+    """Between the clamps' origins once they have moved [m]."""
+    assert boundary.right is not None
+    assert displacement.right is not None
+    left = boundary.left[:3, 3] + displacement.left[:3]
+    right = boundary.right[:3, 3] + displacement.right[:3]
+    return float(np.linalg.norm(right - left))
+
+
+def _random_start(rng: np.random.Generator, config: ShapeEnvConfig) -> BoundaryPoses:
+    along_x = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # d3 = +x, d2 = +z
+    clamps = []
+    for side in (-0.5, 0.5):
+        position = np.array([side * config.start_distance, 0.0, config.start_height])
+        position += rng.uniform(-1.0, 1.0, 3) * config.start_noise[0]
+        tilt = np.append(rng.uniform(-1.0, 1.0, 2) * config.start_noise[1], 0.0)
+        clamps.append(pose(along_x @ exp_so3(tilt), position))
+    return BoundaryPoses(*clamps)
+
+
+def _wander(
+    cell: SimulatedCell,
+    start: BoundaryPoses,
+    rng: np.random.Generator,
+    config: ShapeEnvConfig,
+) -> bool:
+    """Follow ``goal_moves`` random motions in steps; False if one of them is not allowed."""
+    low, high = np.asarray(config.workspace)
+    starts = np.stack([start.left[:3, 3], start.right[:3, 3]])  # type: ignore[index]
+    for _ in range(config.goal_moves):
+        together = rng.uniform(-1.0, 1.0, 3)
+        apart = rng.uniform(-0.5, 0.5, (2, 3))
+        targets = np.clip(starts + config.goal_translation * (together + apart), low, high)
+        rotations = rng.uniform(-1.0, 1.0, (2, 2)) * config.goal_rotation
+        clamps = (cell.boundary.left, cell.boundary.right)
+        twists = [
+            np.concatenate([target - clamp[:3, 3], clamp[:3, :2] @ rotation])  # type: ignore[index]
+            for clamp, target, rotation in zip(clamps, targets, rotations, strict=True)
+        ]
+        motion = BoundaryDisplacement(*twists)
+        translation = np.abs(np.stack(twists)[:, :3]).max() / config.max_translation_step
+        n_steps = int(np.ceil(max(translation, np.abs(rotations).max() / config.max_rotation_step)))
+        for _ in range(n_steps):
+            if advance(cell, motion.scaled(1.0 / n_steps), config):
+                return False
+    return True

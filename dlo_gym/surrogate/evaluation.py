@@ -1,0 +1,99 @@
+"""Scores of a shape predictor on rollouts it has not seen (Section VI-A2)."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from rich.table import Table
+
+from dlo_gym.geometry.se3 import Array, pose, quaternion_to_matrix
+from dlo_gym.metrics import ptp_3d
+from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
+from dlo_gym.surrogate.rollouts import Rollouts
+
+Predict = Callable[[Array, BoundaryDisplacement], Array]
+
+
+@dataclass(frozen=True)
+class Score:
+    """Errors over all moves of some number of steps, PTP3D averaged over the nodes.
+
+    Attributes:
+        n_steps: of 5 mm and pi / 80 rad at most per component, as rollouts have them; 0 for the
+            null action.
+        n_moves: that were predicted.
+        mean_mm, p95_mm: over the moves [mm].
+        max_node_mm: of any node in any move [mm].
+        motion_mm: how far the nodes truly moved, mean [mm].
+    """
+
+    n_steps: int
+    n_moves: int
+    mean_mm: float
+    p95_mm: float
+    max_node_mm: float
+    motion_mm: float
+
+    def as_dict(self) -> dict[str, float]:
+        return asdict(self)
+
+
+def evaluate_predictor(
+    predict: Predict,
+    rollouts: Rollouts,
+    *,
+    n_steps: tuple[int, ...] = (0, 1, 2, 3),
+    stride: int = 1,
+    noise: float = 0.0,
+    seed: int = 0,
+) -> list[Score]:
+    """Scores for moves of each of ``n_steps``, from every ``stride``-th state of the rollouts.
+
+    Args:
+        predict: the centerline (n, 3) after a displacement.
+        noise: standard deviation added to the coordinates that ``predict`` is given [m]; the error
+            is then that of the predicted change.
+        seed: of the noise.
+    """
+    rng = np.random.default_rng(seed)
+    scores = []
+    for steps in n_steps:
+        errors, motions = [], []
+        for positions, clamps in zip(rollouts.positions, rollouts.clamps, strict=True):
+            states = positions.astype(np.float64)
+            boundaries = [boundary(x, c) for x, c in zip(states, clamps, strict=True)]
+            for first in range(0, len(states) - steps, stride):
+                last = first + steps
+                displacement = boundaries[first].displacement_to(boundaries[last])
+                offset = noise * rng.standard_normal(states[first].shape)
+                predicted = predict(states[first] + offset, displacement) - offset
+                errors.append(ptp_3d(predicted, states[last]))
+                motions.append(ptp_3d(states[first], states[last]))
+        error = 1e3 * np.array(errors)
+        mean = error.mean(axis=1)
+        scores.append(
+            Score(
+                steps,
+                len(error),
+                float(mean.mean()),
+                float(np.percentile(mean, 95)),
+                float(error.max()),
+                float(1e3 * np.mean(motions)),
+            )
+        )
+    return scores
+
+
+def boundary(positions: Array, clamps: Array) -> BoundaryPoses:
+    """Clamp poses of one recorded state: positions (n, 3), quaternions wxyz (2, 4)."""
+    rotations = quaternion_to_matrix(clamps)
+    return BoundaryPoses(pose(rotations[0], positions[0]), pose(rotations[1], positions[-1]))
+
+
+def score_table(scores: list[Score]) -> Table:
+    """For the terminal."""
+    table = Table("steps", "moves", "PTP3D mean [mm]", "p95 [mm]", "worst node [mm]", "motion [mm]")
+    for s in scores:
+        values = (s.mean_mm, s.p95_mm, s.max_node_mm, s.motion_mm)
+        table.add_row(str(s.n_steps), str(s.n_moves), *(f"{value:.3f}" for value in values))
+    return table

@@ -1,0 +1,260 @@
+"""Training of the shape predictor (Section VI-A1), and the scores of what was trained."""
+
+import json
+import math
+import os
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from dlo_gym.exceptions import DatasetError, MissingExtra
+from dlo_gym.surrogate.evaluation import evaluate_predictor, score_table
+from dlo_gym.surrogate.predictor import ShapePredictor
+from dlo_gym.surrogate.rollouts import Rollouts, load_rollouts
+from dlo_gym.surrogate.weights_file import Scales, Weights, save_weights
+
+try:
+    import torch
+except ModuleNotFoundError as error:
+    raise MissingExtra("torch", "train") from error
+
+from dlo_gym.surrogate.dataset import Batch, RolloutDataset
+from dlo_gym.surrogate.network import DloNetwork, RelativeNetwork
+
+CHECKPOINT_EVERY = 500
+VALIDATION_SIZE = 4096
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How the network is trained.
+
+    Attributes:
+        seed: of initial weights, split and batches.
+        steps: of the optimiser.
+        batch_size: samples per step.
+        learning_rate: of Adam at the start; it falls to zero along a cosine.
+        noise: standard deviation of the noise on the input's coordinates [m].
+        validation_share: of the rollouts that are held back.
+        hidden: width of the network.
+        plain: the paper's network as written, for comparison: world axes, no first guess, no null
+            action subtracted, mean squared error, constant learning rate.
+
+    Raises:
+        ValueError: naming the field.
+    """
+
+    seed: int = 0
+    steps: int = 20_000
+    batch_size: int = 256
+    learning_rate: float = 5e-4
+    noise: float = 5e-4
+    validation_share: float = 0.1
+    hidden: int = 256
+    plain: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch_size", "hidden"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if not (self.learning_rate > 0 and self.noise >= 0):
+            raise ValueError(
+                "learning_rate, noise: expected a positive and a non-negative number,"
+                f" got {self.learning_rate} and {self.noise}"
+            )
+        if not 0.0 < self.validation_share < 1.0:
+            raise ValueError(f"validation_share: expected 0 to 1, got {self.validation_share}")
+
+
+class Trainer:
+    """A network, its data and its optimiser, from step to step.
+
+    Args:
+        rollouts: to learn from; the last ``validation_share`` of them are held back.
+        settings: how.
+    """
+
+    def __init__(self, rollouts: Rollouts, settings: TrainingSettings) -> None:
+        n = len(rollouts.lengths)
+        cut = n - max(1, round(settings.validation_share * n))
+        if cut < 1:
+            raise DatasetError(f"expected at least 2 rollouts to train and to validate, got {n}")
+        self.settings = settings
+        self.scales = Scales()
+        self.data = RolloutDataset(
+            Rollouts(*(x[:cut] for x in rollouts)), noise=settings.noise, plain=settings.plain
+        )
+        held = RolloutDataset(Rollouts(*(x[cut:] for x in rollouts)), plain=settings.plain)
+        self.held_back = self._batch(held, VALIDATION_SIZE, torch.Generator().manual_seed(1))
+        torch.manual_seed(settings.seed)
+        n_nodes = rollouts.positions.shape[2]
+        kind = DloNetwork if settings.plain else RelativeNetwork
+        self.network = kind(n_nodes, settings.hidden)
+        self.generator = torch.Generator().manual_seed(settings.seed)
+        if isinstance(self.network, RelativeNetwork):
+            self.network.fit(*self._batch(self.data, 80 * settings.batch_size, self.generator))
+        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=settings.learning_rate)
+        self.step_count = 0
+        self.best_loss = math.inf
+        self.best = self._copy()
+        self.history: list[tuple[int, float]] = []
+
+    def step(self) -> None:
+        """One step of the optimiser."""
+        if not self.settings.plain:
+            progress = self.step_count / self.settings.steps
+            for group in self.optimiser.param_groups:
+                group["lr"] = 0.5 * self.settings.learning_rate * (1 + math.cos(math.pi * progress))
+        batch = self._batch(self.data, self.settings.batch_size, self.generator)
+        self.optimiser.zero_grad(set_to_none=True)
+        self._loss(batch).backward()
+        self.optimiser.step()
+        self.step_count += 1
+
+    def validate(self) -> float:
+        """The loss on what was held back; keeps the weights if they are the best so far."""
+        with torch.no_grad():
+            loss = float(self._loss(self.held_back))
+        self.history.append((self.step_count, loss))
+        if loss < self.best_loss:
+            self.best_loss, self.best = loss, self._copy()
+        return loss
+
+    def best_network(self) -> torch.nn.Module:
+        """The network with the best weights so far."""
+        self.network.load_state_dict(self.best)
+        return self.network
+
+    def save(self, file: Path) -> None:
+        """All that is needed to go on exactly from here, written whole or not at all."""
+        content = {
+            "settings": asdict(self.settings),
+            "network": self.network.state_dict(),
+            "best": self.best,
+            "best_loss": self.best_loss,
+            "optimiser": self.optimiser.state_dict(),
+            "generator": self.generator.get_state(),
+            "step_count": self.step_count,
+            "history": self.history,
+        }
+        part = file.with_name(file.name + ".part")
+        try:
+            torch.save(content, part)
+            os.replace(part, file)
+        finally:
+            part.unlink(missing_ok=True)
+
+    def load(self, file: Path) -> None:
+        """Goes on from what ``save`` wrote.
+
+        Raises:
+            DatasetError: if the file is damaged.
+            ValueError: if it was made with other settings.
+        """
+        try:
+            content: dict[str, Any] = torch.load(file, weights_only=True)
+        except (OSError, RuntimeError, EOFError, ValueError) as error:
+            raise DatasetError(f"{file}: damaged checkpoint: {error}") from error
+        if content["settings"] != asdict(self.settings):
+            raise ValueError(
+                f"settings: {file} was made with {content['settings']}, got"
+                f" {asdict(self.settings)}; resume with the same settings"
+            )
+        self.network.load_state_dict(content["network"])
+        self.optimiser.load_state_dict(content["optimiser"])
+        self.generator.set_state(content["generator"])
+        self.best, self.best_loss = content["best"], content["best_loss"]
+        self.step_count, self.history = content["step_count"], content["history"]
+
+    def _batch(self, data: RolloutDataset, size: int, generator: torch.Generator) -> Batch:
+        return data.sample(size, generator, self.scales)
+
+    def _loss(self, batch: Batch) -> torch.Tensor:
+        """The paper's mean squared error, or the mean distance of the nodes: the score itself."""
+        error = self.network(batch.state, batch.actions) - batch.change
+        if self.settings.plain:
+            return 1e4 * error.square().mean()
+        squares = error.view(len(error), -1, 3).square().sum(-1)
+        return (squares + 1e-4).sqrt().mean()
+
+    def _copy(self) -> dict[str, torch.Tensor]:
+        return {name: value.clone() for name, value in self.network.state_dict().items()}
+
+
+def train_surrogate(
+    data: tyro.conf.Positional[Path],
+    /,
+    settings: tyro.conf.OmitArgPrefixes[TrainingSettings] = TrainingSettings(),
+    *,
+    out: Path = Path("runs/surrogate"),
+    threads: int = 2,
+    resume: bool = False,
+    overwrite: bool = False,
+    evaluate: bool = False,
+    weights: Path | None = None,
+) -> None:
+    """Train the shape predictor on rollouts, or score one with --evaluate.
+
+    Args:
+        data: folder made by ``dlo rollouts``.
+        settings: how the network is trained.
+        out: folder for shape_predictor.safetensors, metrics.json and the checkpoint.
+        threads: of torch.
+        resume: go on from the checkpoint in OUT.
+        overwrite: start anew in OUT.
+        evaluate: do not train; score the weights on DATA, which they should not have seen.
+        weights: file to evaluate; the shipped one by default.
+
+    Raises:
+        FileExistsError: if OUT holds a training and neither resume nor overwrite was given.
+        DatasetError: if the data are damaged or incomplete.
+    """
+    console = Console()
+    rollouts, manifest = load_rollouts(data)
+    if evaluate:
+        predictor = ShapePredictor.load(weights)
+        console.print(score_table(evaluate_predictor(predictor.predict, rollouts)))
+        return
+    checkpoint = out / "checkpoint.pt"
+    if checkpoint.exists() and not (resume or overwrite):
+        raise FileExistsError(f"{out} exists; pass --overwrite to start anew or --resume to go on")
+    out.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(threads)
+    trainer = Trainer(rollouts, settings)
+    if resume and checkpoint.exists():
+        trainer.load(checkpoint)
+    started, first_step = time.perf_counter(), trainer.step_count
+    columns = (
+        TextColumn("training"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+    )  # fmt: skip
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("", total=settings.steps, completed=first_step)
+        while trainer.step_count < settings.steps:
+            trainer.step()
+            progress.advance(task)
+            if trainer.step_count % CHECKPOINT_EVERY == 0 or trainer.step_count == settings.steps:
+                loss = trainer.validate()
+                trainer.save(checkpoint)
+                progress.update(task, description=f"validation {loss:.4g}")
+    network = trainer.best_network()
+    metrics = {
+        **asdict(settings),
+        "rollouts": asdict(manifest.settings),
+        "data_sha256": manifest.data_hash,
+        "best_validation_loss": trainer.best_loss,
+        "wall_s": round(time.perf_counter() - started, 1),
+        "wall_s_from_step": first_step,
+        "history": trainer.history,
+    }
+    (out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
+    if isinstance(network, RelativeNetwork):
+        training = {k: v for k, v in metrics.items() if k != "history"}
+        file = out / "shape_predictor.safetensors"
+        save_weights(file, Weights(network.export(), trainer.scales, training))
+        console.print(f"weights in {file}", highlight=False)

@@ -1,0 +1,1 @@
+"""Trained weights; see MODEL_CARD.md."""

@@ -1,0 +1,56 @@
+"""The tracker as an environment's observation model."""
+
+from typing import TYPE_CHECKING, Literal
+
+from dlo_gym.rod.boundary import BoundaryDisplacement
+from dlo_gym.rod.state import ShapeEstimate
+from tracking.predictors import check_predictor, make_predictor
+from tracking.tracker import MultiViewTracker, TrackerConfig
+
+if TYPE_CHECKING:
+    from dlo_gym.envs.cell import SimulatedCell
+
+
+class TrackerObserver:
+    """Knows the rod only from the cell's images and clamp poses.
+
+    Args:
+        predictor: "network" (the shipped ``ShapePredictor``) or "rod".
+        triangulation: see ``TrackerConfig``.
+        lost_after: time unseen until ``TrackLost`` [s].
+    """
+
+    def __init__(
+        self,
+        predictor: Literal["network", "rod"] = "rod",
+        triangulation: Literal["curve", "paper"] = "curve",
+        lost_after: float = 2.0,
+    ) -> None:
+        self._predictor = check_predictor(predictor)
+        self._config = TrackerConfig(triangulation=triangulation, lost_after=lost_after)
+        self._tracker: MultiViewTracker | None = None
+
+    def reset(self, cell: "SimulatedCell") -> ShapeEstimate:
+        """Learns the rod's looks from the first images and tracks it in them."""
+        views = cell.views()
+        predictor = make_predictor(self._predictor, cell.properties, cell.rod_state.n_nodes)
+        self._tracker = MultiViewTracker(
+            predictor, [view.camera for view in views], config=self._config
+        )
+        self._tracker.initialise(cell.boundary, cell.properties, stamp=cell.stamp)
+        at_rest = cell.boundary.displacement_to(cell.boundary)
+        return self._tracker.update(views, at_rest, cell.stamp)
+
+    def update(self, cell: "SimulatedCell", displacement: BoundaryDisplacement) -> ShapeEstimate:
+        """Follows one motion.
+
+        Raises:
+            TrackLost: if the rod has not been seen for too long.
+            ValueError: before the first ``reset``.
+        """
+        if self._tracker is None:
+            raise ValueError("update: the observer has seen nothing yet; call reset first")
+        return self._tracker.update(cell.views(), displacement, cell.stamp)
+
+    def close(self) -> None:
+        self._tracker = None
