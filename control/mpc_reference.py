@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from control.mpc import Plan, ShapeProblem
+from control.problem import Plan, ShapeProblem
 from dlo_gym.exceptions import SolverFailed
 from dlo_gym.geometry.se3 import Array
 

@@ -8,13 +8,14 @@ from numpy.testing import assert_allclose
 
 from control.casadi_surrogate import casadi_step
 from control.models import SurrogateModel
-from control.mpc import MpcConfig, ShapeMPC, ShapeProblem
+from control.mpc import ShapeMPC
 from control.mpc_reference import solve_with_ipopt
+from control.problem import MpcConfig, ShapeProblem
 from control.safety import SafetyLimits
 from dlo_gym.geometry.se3 import exp_so3, frame_along, pose
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.surrogate.predictor import ShapePredictor
-from dlo_gym.surrogate.weights_file import Layers, Scales, Weights
+from dlo_gym.surrogate.weights_file import SHIPPED, Layers, Scales, Weights, load_weights
 
 N_NODES = 11
 
@@ -83,6 +84,16 @@ def test_derivatives_are_the_predictors(weights):
         by_line, by_move = jacobian(line.ravel(), move, np.zeros(3 * N_NODES))
         got = by_line @ d_line.reshape(-1, 5) + by_move @ d_move
         assert_allclose(np.asarray(got), expected.reshape(-1, 5), atol=2e-5)
+
+
+def test_value_of_the_shipped_weights():
+    rng = np.random.default_rng(4)
+    predictor, step = ShapePredictor.load(), casadi_step(load_weights(SHIPPED))
+    line = random_arc(rng, predictor.n_nodes)
+    move = rng.uniform(-1, 1, 12) * np.tile([0.01, 0.01, 0.01, 0.08, 0.08, 0.08], 2)
+    expected = predictor.predict(line, BoundaryDisplacement.from_vector(move))
+    got = np.asarray(step(line.ravel(), move)).reshape(-1, 3)
+    assert_allclose(got, expected, atol=1e-6)
 
 
 def test_ends_above_each_other_are_no_trouble(weights):

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from control.casadi_surrogate import casadi_step
 from control.models import RodModel, SurrogateModel
-from control.mpc import MpcConfig, ShapeMPC, ShapeProblem, step_directions
+from control.mpc import ShapeMPC
 from control.mpc_reference import solve_with_ipopt
+from control.problem import MpcConfig, ShapeProblem, step_directions
 from control.safety import SafetyGate, SafetyLimits
 from dlo_gym.exceptions import SolverFailed
 from dlo_gym.geometry.se3 import exp_so3, pose
@@ -17,6 +19,8 @@ from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.properties import RodProperties
 from dlo_gym.rod.rod import CosseratRod
 from dlo_gym.rod.state import RodState, ShapeEstimate
+from dlo_gym.surrogate.predictor import ShapePredictor
+from dlo_gym.surrogate.weights_file import SHIPPED, load_weights
 
 ROD = RodProperties(length=0.5)
 LIMITS = SafetyLimits(min_gripper_distance=0.12, workspace=((-0.4, -0.25, 0.2), (0.4, 0.25, 0.6)))
@@ -247,15 +251,28 @@ def close_the_loop(seed: int, mpc: ShapeMPC, n_steps: int, noise: float = 0.0) -
     return np.array(errors)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.fixture(scope="module")
+def surrogate() -> SurrogateModel:
+    return SurrogateModel(ShapePredictor.load())
+
+
+@pytest.mark.parametrize("seed", range(2))
 def test_closed_loop_on_the_true_rod(seed):
-    errors = close_the_loop(seed, ShapeMPC(RodModel(), LIMITS), 40)
+    errors = close_the_loop(seed, ShapeMPC(RodModel(), LIMITS), 30)
     assert errors[-1] < 1e-3
 
 
+@pytest.mark.parametrize("seed", range(2, 5))
+def test_closed_loop_on_the_surrogate(seed, surrogate):
+    errors = close_the_loop(seed, ShapeMPC(surrogate, LIMITS), 30)
+    assert errors[-1] < 2e-3
+
+
 @pytest.mark.slow
-def test_closed_loop_reaches_every_goal():
-    final = [close_the_loop(seed, ShapeMPC(RodModel(), LIMITS), 60)[-1] for seed in range(30)]
+@pytest.mark.parametrize("model", ["rod", "surrogate"])
+def test_closed_loop_reaches_every_goal(model, surrogate):
+    used = RodModel() if model == "rod" else surrogate
+    final = [close_the_loop(seed, ShapeMPC(used, LIMITS), 60)[-1] for seed in range(30)]
     assert np.max(final) < 2e-3
 
 
@@ -343,3 +360,23 @@ def test_impossible_goals_are_refused():
 def test_senseless_settings_are_refused(field, value):
     with pytest.raises(ValueError, match=field):
         MpcConfig(**{field: value})
+
+
+@pytest.mark.slow
+def test_the_shipped_surrogate_agrees_with_ipopt(surrogate):
+    _, state, goal = goal_and_start(3)
+    n = len(goal)
+    problem = ShapeProblem(
+        centerline=state.positions,
+        boundary=state.boundary,
+        goal=state.positions + 0.12 * (goal - state.positions),
+        node_weights=np.ones(n),
+        disturbance=np.zeros((n, 3)),
+        previous=np.zeros(10),
+        limits=LIMITS,
+        config=MpcConfig(horizon=2),
+    )
+    start = np.zeros((2, 10))
+    fast = ShapeMPC(surrogate, LIMITS, problem.config).solve(problem, start, iterations=40)
+    exact = solve_with_ipopt(problem, casadi_step(load_weights(SHIPPED)), start)
+    assert fast.cost == pytest.approx(exact.cost, rel=1e-3)
