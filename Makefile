@@ -2,7 +2,10 @@
 
 VENV   ?= .venv
 BIN    := $(VENV)/bin
-PYTHON ?= $(firstword $(shell command -v python3.12 python3.11 python3))
+# The first interpreter that runs and has a version the project is tested with.
+PYTHON ?= $(shell for python in python3 python3.11 python3.12; do \
+  $$python -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 13))' 2>/dev/null \
+  && echo $$python && break; done)
 OUT    ?= out/demo
 
 # Numerical libraries run one thread each: faster here, and steadier, than two on small problems.
@@ -37,8 +40,8 @@ clean:
 # Setting up -------------------------------------------------------------------------------------
 
 $(VENV)/.venv:
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
-	  || { echo "dlo-gym needs Python 3.11 or 3.12; say which with  make PYTHON=python3.12"; exit 1; }
+	@test -n "$(PYTHON)" \
+	  || { echo "dlo-gym needs Python 3.11 or 3.12; say where with  make PYTHON=/path/to/python3.11"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
 	@touch $@

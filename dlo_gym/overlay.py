@@ -1,5 +1,7 @@
 """Draws centerlines into a view's image."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +49,11 @@ def draw_centerline(
                 cv2.line(image, *ends, shade, width, cv2.LINE_AA, _SHIFT)
 
 
-def draw_legend(image: NDArray[np.uint8], entries: list[tuple[str, tuple[int, int, int]]]) -> None:
-    """Writes coloured samples with their meaning into the upper left corner, in place."""
+def draw_legend(
+    image: NDArray[np.uint8], entries: Sequence[tuple[str, tuple[int, int, int] | None]]
+) -> None:
+    """Writes coloured samples with their meaning into the upper left corner, in place; a text
+    without a colour starts at the margin."""
     scale = max(image.shape[0] / 1080, 0.34)
     line = round(34 * scale)
     font = (cv2.FONT_HERSHEY_SIMPLEX, 0.8 * scale)

@@ -21,7 +21,7 @@ NARROWEST, WIDEST = 0.6, 1.7
 # Half a pixel lies between a border pixel's centre and the border.
 PIXEL = 0.5
 SHORTEST = 3  # nodes of a piece that counts
-REACH = 2.2  # of the sampling distance, the longest edge
+REACH = 2.6  # of the sampling distance, the longest edge
 SMALLEST_COSINE = 0.7  # between an edge and the centerline's direction at either of its nodes
 
 
@@ -88,7 +88,8 @@ def local_maxima(
         return np.zeros((0, 2))
     distance = cv2.distanceTransform((mask > 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     dilated = cv2.dilate(distance, np.ones((3, 3), np.uint8))
-    narrowest = max(NARROWEST * radius[0], 0.5)
+    # A thin cable's border pixels may be lost to the background that they are mixed with.
+    narrowest = max(NARROWEST * radius[0] - 0.4, 0.4)
     widest = WIDEST * radius[1] + 1.0
     found = _maxima(distance, dilated, occupancy, narrowest + PIXEL, widest + PIXEL)
     return found.astype(np.float64)

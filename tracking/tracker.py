@@ -308,13 +308,23 @@ class MultiViewTracker:
         return self._with_ends(predicted, boundary)
 
     def _with_ends(self, centerline: Array, boundary: BoundaryPoses | None = None) -> Array:
-        """The centerline with the first and last element where the clamps hold them."""
+        """The centerline with its first and last element where the clamps hold them.
+
+        What the ends were off by is carried into the shape, fading towards the other end, so that
+        no kink remains.
+        """
         boundary = boundary or self._boundary
         h = self._element_length
-        held = centerline.copy()
-        held[:2] = transform_points(boundary.left, [[0.0, 0.0, 0.0], [0.0, 0.0, h]])
-        if boundary.right is not None:
-            held[-2:] = transform_points(boundary.right, [[0.0, 0.0, -h], [0.0, 0.0, 0.0]])
+        left = transform_points(boundary.left, [[0.0, 0.0, 0.0], [0.0, 0.0, h]])
+        share = np.linspace(0.0, 1.0, len(centerline))[:, None]
+        if boundary.right is None:
+            held = centerline + left[0] - centerline[0]
+        else:
+            right = transform_points(boundary.right, [[0.0, 0.0, -h], [0.0, 0.0, 0.0]])
+            first, last = left[0] - centerline[0], right[1] - centerline[-1]
+            held = centerline + (1.0 - share) * first + share * last
+            held[-2:] = right
+        held[:2] = left
         return held
 
     def _look(
@@ -458,7 +468,8 @@ class MultiViewTracker:
             points = triangulate(np.array(projectors), np.array(centres), np.array(weights))
             good = np.isfinite(points).all(axis=1)
             centerline[good] = points[good]
-        centerline = self._with_ends(centerline)
+        held = self._fixed
+        centerline[held] = predicted[held]
         seen = visible.any(axis=0)
         deviation = np.where(seen, self.config.prediction_uncertainty, uncertainty)
         clock.note("triangulation")

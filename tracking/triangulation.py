@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import inv, solve
+from scipy.linalg import solve
 
 from dlo_gym.geometry.camera import CameraModel
 from dlo_gym.geometry.se3 import Array
@@ -155,9 +155,7 @@ class CurveFit(NamedTuple):
         unknown = (3 * self.free[:, None] + np.arange(3)).ravel()
         deviation = np.zeros(len(self.centerline))
         if len(unknown):
-            covariance = inv(
-                self.information[np.ix_(unknown, unknown)], assume_a="pos", check_finite=False
-            )
+            covariance = np.linalg.inv(self.information[np.ix_(unknown, unknown)])
             deviation[self.free] = np.sqrt(np.diag(covariance).reshape(-1, 3).sum(axis=1))
         return deviation
 
