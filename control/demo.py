@@ -37,6 +37,7 @@ def demo(
     image_height: int = 720,
     occluders: int = 1,
     clutter: bool = True,
+    quality: Literal["fast", "high"] = "fast",
     model: Literal["surrogate", "rod"] = "surrogate",
     overwrite: bool = False,
 ) -> None:
@@ -52,6 +53,7 @@ def demo(
         image_height: of both views [pixels], 16:9.
         occluders: panels that pass in front of the cameras.
         clutter: put industrial parts and other cables into the scene.
+        quality: of the rendering; high has shadows and antialiasing and takes several times longer.
         model: what the MPC plans on: the trained surrogate, or the rod itself.
         overwrite: replace ``out`` if it exists.
     """
@@ -68,6 +70,7 @@ def demo(
         n_occluders=occluders,
         clutter="industrial" if clutter else "none",
         n_distractor_cables=3 if clutter else 0,
+        quality=quality,
         max_episode_steps=steps,
         goal_distance=(0.06, 0.12),
     )
