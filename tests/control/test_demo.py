@@ -1,0 +1,50 @@
+"""The demo end to end, short and small: real rendering, tracking, control, report."""
+
+import json
+
+import pytest
+
+from control.demo import demo
+from dlo_gym.recording import Recording
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("demo") / "out"
+    demo(out=out, seed=1, steps=8, image_height=270, clutter=False)
+    return out
+
+
+def test_the_cable_comes_closer_and_is_tracked(folder):
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["initial_shape_error_mm"] >= 60.0
+    assert metrics["final_shape_error_mm"] < 0.5 * metrics["initial_shape_error_mm"]
+    assert metrics["tracking_ptp3d_mm"] < 1.5
+    assert isinstance(metrics["success"], bool)
+    for name in ("control_ms", "tracking_ms"):
+        assert 0.0 < metrics[name]["median"] <= metrics[name]["p99"]
+
+
+def test_the_recording_is_whole_and_has_the_truth(folder):
+    recording = Recording.load(folder / "recording")
+    assert len(recording) == 9
+    assert {view.camera.name for view in recording.views(3)} == {"side", "top"}
+    assert recording.centerline.shape == (9, 51, 3)
+
+
+def test_the_page_shows_what_lies_beside_it(folder):
+    page = (folder / "report.html").read_text()
+    for name in ("views.mp4", "views.png", "plots.png"):
+        assert name in page
+        assert (folder / name).stat().st_size > 1000
+    assert not list(folder.parent.glob(".*part*"))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"steps": 0}, "steps"), ({"image_height": 20}, "image_height"), ({"seed": -1}, "seed")],
+)
+def test_bad_options_are_named_and_leave_nothing(tmp_path, options, message):
+    with pytest.raises(ValueError, match=message):
+        demo(out=tmp_path / "out", **options)
+    assert not list(tmp_path.iterdir())
