@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dlo_gym.surrogate.rollouts import Rollouts
+from dlo_gym.surrogate.simulation import Rollouts
 from dlo_gym.surrogate.weights_file import Scales
 
 

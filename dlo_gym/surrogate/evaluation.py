@@ -1,7 +1,7 @@
 """Scores of a shape predictor on rollouts it has not seen (Section VI-A2)."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from rich.table import Table
@@ -9,7 +9,7 @@ from rich.table import Table
 from dlo_gym.geometry.se3 import Array, pose, quaternion_to_matrix
 from dlo_gym.metrics import ptp_3d
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
-from dlo_gym.surrogate.rollouts import Rollouts
+from dlo_gym.surrogate.simulation import Rollouts
 
 Predict = Callable[[Array, BoundaryDisplacement], Array]
 
@@ -33,9 +33,6 @@ class Score:
     p95_mm: float
     max_node_mm: float
     motion_mm: float
-
-    def as_dict(self) -> dict[str, float]:
-        return asdict(self)
 
 
 def evaluate_predictor(

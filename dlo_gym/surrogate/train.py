@@ -2,20 +2,25 @@
 
 import json
 import math
-import os
-import time
+import pickle
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from dlo_gym.exceptions import DatasetError, MissingExtra
-from dlo_gym.surrogate.evaluation import evaluate_predictor, score_table
+from dlo_gym.exceptions import DatasetError, MissingExtra, WeightsError
+from dlo_gym.geometry.se3 import Array, exp_so3, matrix_to_quaternion
+from dlo_gym.rod.boundary import BoundaryDisplacement
+from dlo_gym.surrogate.atomic_file import written_aside
+from dlo_gym.surrogate.evaluation import Score, evaluate_predictor, score_table
 from dlo_gym.surrogate.predictor import ShapePredictor
-from dlo_gym.surrogate.rollouts import Rollouts, load_rollouts
+from dlo_gym.surrogate.rollouts import load_rollouts
+from dlo_gym.surrogate.simulation import Rollouts
 from dlo_gym.surrogate.weights_file import Scales, Weights, save_weights
 
 try:
@@ -23,7 +28,7 @@ try:
 except ModuleNotFoundError as error:
     raise MissingExtra("torch", "train") from error
 
-from dlo_gym.surrogate.dataset import Batch, RolloutDataset
+from dlo_gym.surrogate.dataset import Batch, Moves, RolloutDataset, encode_plain
 from dlo_gym.surrogate.network import DloNetwork, RelativeNetwork
 
 CHECKPOINT_EVERY = 500
@@ -89,12 +94,14 @@ class Trainer:
         self.data = RolloutDataset(
             Rollouts(*(x[:cut] for x in rollouts)), noise=settings.noise, plain=settings.plain
         )
-        held = RolloutDataset(Rollouts(*(x[cut:] for x in rollouts)), plain=settings.plain)
-        self.held_back = self._batch(held, VALIDATION_SIZE, torch.Generator().manual_seed(1))
+        self.held_back = Rollouts(*(x[cut:] for x in rollouts))
+        held_back = RolloutDataset(self.held_back, plain=settings.plain)
+        generator = torch.Generator().manual_seed(1)
+        self.validation = self._batch(held_back, VALIDATION_SIZE, generator)
         torch.manual_seed(settings.seed)
         n_nodes = rollouts.positions.shape[2]
         kind = DloNetwork if settings.plain else RelativeNetwork
-        self.network = kind(n_nodes, settings.hidden)
+        self.network: DloNetwork | RelativeNetwork = kind(n_nodes, settings.hidden)
         self.generator = torch.Generator().manual_seed(settings.seed)
         if isinstance(self.network, RelativeNetwork):
             self.network.fit(*self._batch(self.data, 80 * settings.batch_size, self.generator))
@@ -119,19 +126,32 @@ class Trainer:
     def validate(self) -> float:
         """The loss on what was held back; keeps the weights if they are the best so far."""
         with torch.no_grad():
-            loss = float(self._loss(self.held_back))
+            loss = float(self._loss(self.validation))
         self.history.append((self.step_count, loss))
         if loss < self.best_loss:
             self.best_loss, self.best = loss, self._copy()
         return loss
 
-    def best_network(self) -> torch.nn.Module:
+    def best_network(self) -> DloNetwork | RelativeNetwork:
         """The network with the best weights so far."""
         self.network.load_state_dict(self.best)
         return self.network
 
+    def score(self) -> list[Score]:
+        """Of the best weights on the rollouts held back."""
+        network = self.best_network()
+        if isinstance(network, RelativeNetwork):
+            predict = ShapePredictor(Weights(network.export(), self.scales, {})).predict
+        else:
+            predict = partial(predict_plain, network)
+        return evaluate_predictor(predict, self.held_back, stride=5)
+
     def save(self, file: Path) -> None:
-        """All that is needed to go on exactly from here, written whole or not at all."""
+        """All that is needed to go on exactly from here, written whole or not at all.
+
+        Raises:
+            WeightsError: if it cannot be written.
+        """
         content = {
             "settings": asdict(self.settings),
             "network": self.network.state_dict(),
@@ -142,24 +162,20 @@ class Trainer:
             "step_count": self.step_count,
             "history": self.history,
         }
-        part = file.with_name(file.name + ".part")
-        try:
-            torch.save(content, part)
-            os.replace(part, file)
-        finally:
-            part.unlink(missing_ok=True)
+        with written_aside(file, WeightsError) as part, part.open("wb") as stream:
+            torch.save(content, stream)
 
     def load(self, file: Path) -> None:
         """Goes on from what ``save`` wrote.
 
         Raises:
-            DatasetError: if the file is damaged.
+            WeightsError: if the file is damaged.
             ValueError: if it was made with other settings.
         """
         try:
             content: dict[str, Any] = torch.load(file, weights_only=True)
-        except (OSError, RuntimeError, EOFError, ValueError) as error:
-            raise DatasetError(f"{file}: damaged checkpoint: {error}") from error
+        except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+            raise WeightsError(f"{file}: damaged checkpoint: {error}") from error
         if content["settings"] != asdict(self.settings):
             raise ValueError(
                 f"settings: {file} was made with {content['settings']}, got"
@@ -184,6 +200,24 @@ class Trainer:
 
     def _copy(self) -> dict[str, torch.Tensor]:
         return {name: value.clone() for name, value in self.network.state_dict().items()}
+
+
+def predict_plain(
+    network: DloNetwork, centerline: Array, displacement: BoundaryDisplacement
+) -> Array:
+    """The centerline (n, 3) [m] that the paper's network as written predicts."""
+    assert displacement.right is not None
+    twists = np.stack([displacement.left, displacement.right])
+    moves = Moves(
+        torch.from_numpy(centerline).float()[None],
+        torch.zeros(1, *centerline.shape),
+        torch.from_numpy(twists[:, :3]).float()[None],
+        torch.from_numpy(matrix_to_quaternion(exp_so3(twists[:, 3:]))).float()[None],
+    )
+    batch = encode_plain(moves)
+    with torch.no_grad():
+        change = network(batch.state, batch.actions)
+    return centerline + change.numpy().astype(np.float64).reshape(-1, 3)
 
 
 def train_surrogate(
@@ -220,41 +254,53 @@ def train_surrogate(
         predictor = ShapePredictor.load(weights)
         console.print(score_table(evaluate_predictor(predictor.predict, rollouts)))
         return
-    checkpoint = out / "checkpoint.pt"
-    if checkpoint.exists() and not (resume or overwrite):
+    names = ("checkpoint.pt", "metrics.json", "shape_predictor.safetensors")
+    checkpoint, metrics, file = (out / name for name in names)
+    if any((out / name).exists() for name in names) and not (resume or overwrite):
         raise FileExistsError(f"{out} exists; pass --overwrite to start anew or --resume to go on")
     out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(threads)
     trainer = Trainer(rollouts, settings)
     if resume and checkpoint.exists():
         trainer.load(checkpoint)
-    started, first_step = time.perf_counter(), trainer.step_count
-    columns = (
-        TextColumn("training"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-        TextColumn("{task.description}"),
-    )  # fmt: skip
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("", total=settings.steps, completed=first_step)
-        while trainer.step_count < settings.steps:
-            trainer.step()
-            progress.advance(task)
-            if trainer.step_count % CHECKPOINT_EVERY == 0 or trainer.step_count == settings.steps:
-                loss = trainer.validate()
-                trainer.save(checkpoint)
-                progress.update(task, description=f"validation {loss:.4g}")
-    network = trainer.best_network()
-    metrics = {
+    else:
+        for name in names:
+            (out / name).unlink(missing_ok=True)
+    _run(trainer, checkpoint, console)
+    scores = trainer.score()
+    console.print(score_table(scores))
+    training = {
         **asdict(settings),
         "rollouts": asdict(manifest.settings),
         "data_sha256": manifest.data_hash,
         "best_validation_loss": trainer.best_loss,
-        "wall_s": round(time.perf_counter() - started, 1),
-        "wall_s_from_step": first_step,
+    }
+    content = {
+        **training,
+        "validation": [asdict(score) for score in scores],
         "history": trainer.history,
     }
-    (out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
+    with written_aside(metrics, WeightsError) as part:
+        part.write_text(json.dumps(content, indent=1) + "\n")
+    network = trainer.best_network()
     if isinstance(network, RelativeNetwork):
-        training = {k: v for k, v in metrics.items() if k != "history"}
-        file = out / "shape_predictor.safetensors"
         save_weights(file, Weights(network.export(), trainer.scales, training))
         console.print(f"weights in {file}", highlight=False)
+
+
+def _run(trainer: Trainer, checkpoint: Path, console: Console) -> None:
+    """All steps that are left, with validation and checkpoint at intervals."""
+    columns = (
+        TextColumn("training"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+    )  # fmt: skip
+    n_steps = trainer.settings.steps
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("", total=n_steps, completed=trainer.step_count)
+        while trainer.step_count < n_steps:
+            trainer.step()
+            progress.advance(task)
+            if trainer.step_count % CHECKPOINT_EVERY == 0 or trainer.step_count == n_steps:
+                loss = trainer.validate()
+                trainer.save(checkpoint)
+                progress.update(task, description=f"validation {loss:.4g}")

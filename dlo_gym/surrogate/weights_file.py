@@ -1,7 +1,6 @@
 """The file of the shape predictor's weights: safetensors, which holds numbers and no code."""
 
 import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from dlo_gym.exceptions import WeightsError
+from dlo_gym.surrogate.atomic_file import written_aside
 
 SCHEMA = "dlo-shape-predictor/1"
 SHIPPED = Path(__file__).parent / "weights" / "shape_predictor.safetensors"
@@ -64,7 +64,11 @@ class Weights(NamedTuple):
 
 
 def save_weights(file: Path, weights: Weights) -> None:
-    """Writes ``file``, whole or not at all."""
+    """Writes ``file``, whole or not at all.
+
+    Raises:
+        WeightsError: if it cannot be written.
+    """
     tensors = {"guess": weights.layers.guess}
     for block in DEPTHS:
         for i, (weight, bias) in enumerate(getattr(weights.layers, block)):
@@ -74,12 +78,8 @@ def save_weights(file: Path, weights: Weights) -> None:
         "scales": json.dumps(asdict(weights.scales)),
         "training": json.dumps(weights.training),
     }
-    part = file.with_name(file.name + ".part")
-    try:
+    with written_aside(file, WeightsError) as part:
         part.write_bytes(save(tensors, metadata))
-        os.replace(part, file)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def load_weights(file: Path) -> Weights:

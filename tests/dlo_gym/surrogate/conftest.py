@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
-from dlo_gym.surrogate.rollouts import Rollouts, RolloutSettings, simulate_rollout
+from dlo_gym.surrogate.simulation import Rollouts, RolloutSettings, simulate_rollout
 
 
 @pytest.fixture(scope="session")
 def small_settings() -> RolloutSettings:
-    return RolloutSettings(n_rollouts=6, seed=3, n_actions=2, n_steps=5, shard_size=2)
+    return RolloutSettings(n_rollouts=6, seed=3, n_actions=2, n_steps=10, shard_size=2)
 
 
 @pytest.fixture(scope="session")

@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
 
-from dlo_gym.geometry.se3 import exp_so3, transform_points
+from dlo_gym.geometry.se3 import exp_so3, frame_along, transform_points
 from dlo_gym.geometry.se3 import pose as make_pose
-from dlo_gym.rod.boundary import BoundaryDisplacement
+from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.initial_shapes import random_boundary
 from dlo_gym.rod.properties import RodProperties
 from dlo_gym.rod.rod import CosseratRod
 from dlo_gym.surrogate.evaluation import evaluate_predictor
 from dlo_gym.surrogate.predictor import ShapePredictor
-from dlo_gym.surrogate.rollouts import random_action
+from dlo_gym.surrogate.simulation import random_action
 from dlo_gym.surrogate.weights_file import SHIPPED, load_weights
 
 
@@ -46,11 +46,9 @@ class TestPrediction:
             assert score.mean_mm <= 0.15 * score.motion_mm
 
     def test_agrees_with_the_environment_s_start(self, predictor):
-        forward = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]).T
+        forward = frame_along([1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
         rod = CosseratRod(RodProperties(length=0.5))
         clamps = [make_pose(forward, [x, 0.0, 0.34]) for x in (-0.2, 0.2)]
-        from dlo_gym.rod.boundary import BoundaryPoses
-
         rod.settle(BoundaryPoses(*clamps))
         for seed in range(5):
             start, action = rod.state, move(rod, seed)

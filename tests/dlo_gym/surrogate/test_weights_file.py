@@ -1,3 +1,4 @@
+import itertools
 import json
 from pathlib import Path
 
@@ -27,7 +28,7 @@ def random_weights(n_nodes: int = 7, hidden: int = 8, seed: int = 0) -> Weights:
                 rng.normal(0.0, 1.5 / np.sqrt(a), (b, a)).astype(np.float32),
                 rng.normal(0.0, 0.1, b).astype(np.float32),
             )
-            for a, b in zip(sizes[:-1], sizes[1:], strict=True)
+            for a, b in itertools.pairwise(sizes)
         ]
 
     size, half = 3 * n_nodes, hidden // 2
