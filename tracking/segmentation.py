@@ -16,6 +16,7 @@ Colours = NDArray[np.float32]
 
 BITS = 5  # per channel of the colour table
 LEVELS = 1 << BITS
+CLEAR = 6.0  # times the median strength, a ridge that counts in full
 RAREST = 0.08  # share of the cable's pixels below which a colour is not the cable's
 
 
@@ -101,6 +102,8 @@ class ColourSegmenter:
         strip = straighten(view.image, pixels, radius, uncertainty + 8.0 * radius)
         strength = ridge_strength(strip)
         noise = float(np.median(strength)) + 1.0
+        # A ridge is clear or not: one that stands out more is not the more likely the cable.
+        strength = np.minimum(strength, CLEAR * noise)
         table = self._learn(strip, strength, held, noise)
         if table is None:
             return False

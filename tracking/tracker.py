@@ -2,34 +2,24 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from time import perf_counter
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, Protocol
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from dlo_gym.exceptions import DloError, TrackLost
 from dlo_gym.geometry.camera import CameraModel, View
-from dlo_gym.geometry.curves import arc_length
 from dlo_gym.geometry.se3 import Array, transform_points
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.properties import RodProperties
 from dlo_gym.rod.rod import CosseratRod
 from dlo_gym.rod.state import ShapeEstimate
-from tracking.association import Association, associate, correct_occluded
-from tracking.graph import EMPTY, CenterlineGraph, build_graph
+from tracking.acquisition import acquire
+from tracking.correction import Clock, Sighting, fit_to_views, residuals, triangulate_nodes
+from tracking.graph import EMPTY, build_graph
+from tracking.projection import occupancy_mask, pixels_per_metre
 from tracking.segmentation import ColourSegmenter, Segmenter
-from tracking.triangulation import (
-    SIGHT_NOISE,
-    Sight,
-    fit_curve,
-    ray_projectors,
-    sight_across,
-    triangulate,
-)
 
-SETTLED = 2e-4  # of any coordinate between two passes [m]
+ACQUIRED = 2e-3  # standard deviation of what a search gives beside the fit's own [m]
 COMPONENTS = ("prediction", "segmentation", "graph", "association", "triangulation")
 
 
@@ -93,17 +83,6 @@ class TrackerConfig:
         for name in ("initial_uncertainty", "prediction_uncertainty", "band", "lost_after"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
-
-
-class _Sighting(NamedTuple):
-    """One view's graph, with where the prediction lies in it."""
-
-    row: int  # of the camera among the tracker's
-    camera: CameraModel
-    graph: CenterlineGraph
-    scale: Array  # (n,) pixels per metre at each predicted node
-    reach: Array  # (n,) half-width of the occupancy mask [pixels]
-    radius: float  # of the rod [pixels]
 
 
 class MultiViewTracker:
@@ -229,8 +208,9 @@ class MultiViewTracker:
         if stamp is None:
             stamp = max((view.stamp for view in present.values()), default=self._stamp)
         self._stamp = max(self._stamp, float(stamp))
+        notes += [f"view {name!r} is missing" for name in self._index if name not in present]
 
-        clock = _Clock(timings)
+        clock = Clock(timings)
         boundary = self._boundary.displaced(displacement)
         predicted = self._predict(previous, displacement, boundary, notes)
         motion = np.linalg.norm(predicted - previous, axis=1)
@@ -241,6 +221,8 @@ class MultiViewTracker:
         self._boundary = boundary
         clock.note("prediction")
 
+        predicted, uncertainty = self._acquire(present, predicted, uncertainty, notes)
+        clock.note("segmentation")
         sightings = [
             sighting
             for name in self._index
@@ -251,12 +233,30 @@ class MultiViewTracker:
             )
         ]
         if self.config.triangulation == "paper":
-            centerline, visible, deviation = self._triangulate(
-                predicted, uncertainty, sightings, clock
+            correction = triangulate_nodes(
+                predicted,
+                uncertainty,
+                sightings,
+                self._fixed,
+                self.config.prediction_uncertainty,
+                clock,
             )
         else:
-            centerline, visible, deviation = self._fit(predicted, uncertainty, sightings, clock)
-        self._residuals = self._measure_residuals(centerline, visible, sightings)
+            correction = fit_to_views(
+                predicted,
+                uncertainty,
+                sightings,
+                self._element_length,
+                self._fixed,
+                self.config.passes,
+                clock,
+            )
+        centerline, deviation = correction.centerline, correction.deviation
+        visible = np.zeros((len(self.cameras), len(centerline)), dtype=bool)
+        self._residuals = np.full(visible.shape, np.nan)
+        for sighting, nodes in zip(sightings, correction.visible, strict=True):
+            visible[sighting.row] = nodes
+            self._residuals[sighting.row] = residuals(sighting, centerline, nodes)
         seen = bool(visible.any())
         if not seen:
             deviation = np.maximum(deviation, self.config.unseen_growth * self._uncertainty)
@@ -327,6 +327,32 @@ class MultiViewTracker:
         held[:2] = left
         return held
 
+    def _acquire(
+        self,
+        present: dict[str, View],
+        predicted: Array,
+        uncertainty: Array,
+        notes: list[str],
+    ) -> tuple[Array, Array]:
+        """Prediction and uncertainty after a search for the rod in views that do not know its
+        looks yet, if the prediction is too vague to learn them there.
+
+        Views in which they could only be guessed are taken out of ``present``, with a note.
+        """
+        unknown = sorted(set(present) - self._fitted)
+        if not unknown or self.config.band * uncertainty.max() <= self.config.smallest_band:
+            return predicted, uncertainty
+        found = acquire(
+            tuple(present.values()), predicted, self._fixed, self._element_length, self._radius
+        )
+        if found is not None:
+            curve, deviation = found
+            return curve, np.hypot(deviation, ACQUIRED)
+        for name in unknown:
+            del present[name]
+            notes.append(f"view {name!r}: nothing in it looks like the rod")
+        return predicted, uncertainty
+
     def _look(
         self,
         name: str,
@@ -334,11 +360,10 @@ class MultiViewTracker:
         predicted: Array,
         uncertainty: Array,
         notes: list[str],
-        clock: "_Clock",
-    ) -> _Sighting | None:
+        clock: Clock,
+    ) -> Sighting | None:
         """Steps V-A1 and V-A2 in one view; None, with a note, if nothing usable is in it."""
         if view is None:
-            notes.append(f"view {name!r} is missing")
             return None
         camera = view.camera
         pixels = camera.project(predicted)
@@ -351,7 +376,7 @@ class MultiViewTracker:
         reach = band + 2.0 * radii
         if name not in self._fitted:
             held = (True, self._boundary.right is not None)
-            spread = float(band.max())
+            spread = float((self.config.band * uncertainty * scale).max())
             if not self.segmenter.fit(
                 view, pixels, float(np.median(radii)), uncertainty=spread, held=held
             ):
@@ -369,161 +394,15 @@ class MultiViewTracker:
         if not len(graph.edges):
             notes.append(f"view {name!r}: the rod is not in sight")
             return None
-        return _Sighting(self._index[name], camera, graph, scale, reach, float(np.median(radii)))
-
-    def _associate(
-        self, sighting: _Sighting, curve: Array, gate: Array, smallest_cosine: float = 0.5
-    ) -> tuple[Array, Association]:
-        """The curve's pixels in one view and what they are associated with."""
-        pixels = sighting.camera.project(curve)
-        overshoot = 0.5 * self._element_length * sighting.scale
-        association = associate(pixels, sighting.graph, gate, overshoot, smallest_cosine)
-        in_image = sighting.camera.sees(pixels)
-        return pixels, association._replace(visible=association.visible & in_image)
-
-    def _fit(
-        self, predicted: Array, uncertainty: Array, sightings: list[_Sighting], clock: "_Clock"
-    ) -> tuple[Array, NDArray[np.bool_], Array]:
-        """Association and curve fit in turns, with ever narrower gates.
-
-        The first turns trust the images less, so that the smooth correction that most of the rod
-        asks for is found before a stray piece can bend it.
-        """
-        visible = np.zeros((len(self.cameras), len(predicted)), dtype=bool)
-        if not sightings:
-            return predicted, visible, uncertainty
-        curve, fit = predicted, None
-        for turn in range(2 * self.config.passes):
-            cosine = 0.5 if turn == 0 else 0.85
-            caution = 2.0 ** max(self.config.passes - 1 - turn, 0)
-            sights: list[Sight] = []
-            for sighting in sightings:
-                gate = np.maximum(sighting.reach * 0.5**turn, 2.0 * sighting.radius + 2.0)
-                _, found = self._associate(sighting, curve, gate, cosine)
-                distance = np.linalg.norm(found.offsets, axis=1)
-                weights = found.visible / (1.0 + (2.0 * distance / gate) ** 2)
-                sights.append(
-                    sight_across(sighting.camera, found.points, found.directions, weights)
-                )
-            clock.note("association")
-            fit = fit_curve(
-                predicted,
-                curve,
-                sights,
-                self._element_length,
-                uncertainty,
-                self._fixed,
-                sight_noise=caution * SIGHT_NOISE,
-            )
-            if not np.isfinite(fit.centerline).all():
-                return predicted, visible, uncertainty
-            step = np.abs(fit.centerline - curve).max()
-            curve = fit.centerline
-            clock.note("triangulation")
-            if turn >= self.config.passes - 1 and step < SETTLED:
-                break
-        assert fit is not None
-        deviation = fit.deviation()
-        clock.note("triangulation")
-        for sighting in sightings:
-            gate = np.full(len(curve), sighting.radius + 1.5)
-            visible[sighting.row] = self._associate(sighting, curve, gate)[1].visible
-        clock.note("association")
-        return curve, visible, deviation
-
-    def _measure_residuals(
-        self, centerline: Array, visible: NDArray[np.bool_], sightings: list[_Sighting]
-    ) -> Array:
-        residuals = np.full(visible.shape, np.nan)
-        for sighting in sightings:
-            _, found = self._associate(sighting, centerline, sighting.reach)
-            seen = visible[sighting.row]
-            residuals[sighting.row, seen] = np.linalg.norm(found.offsets[seen], axis=1)
-        return residuals
-
-    def _triangulate(
-        self, predicted: Array, uncertainty: Array, sightings: list[_Sighting], clock: "_Clock"
-    ) -> tuple[Array, NDArray[np.bool_], Array]:
-        """Steps V-A3 and V-B: offsets completed in each view, then Eq. (1) and (2).
-
-        A node hidden in a view weighs less there than one that is seen.
-        """
-        n = len(predicted)
-        visible = np.zeros((len(self.cameras), n), dtype=bool)
-        fixed_ends = (True, self._boundary.right is not None)
-        projectors, centres, weights = [], [], []
-        for sighting in sightings:
-            pixels, found = self._associate(sighting, predicted, sighting.reach)
-            if not found.visible.any():
-                continue
-            visible[sighting.row] = found.visible
-            corrected = pixels + correct_occluded(found, arc_length(predicted), fixed_ends)
-            rays = sighting.camera.rays(np.nan_to_num(corrected))
-            projectors.append(ray_projectors(rays))
-            centres.append(sighting.camera.centre)
-            weights.append(np.where(found.visible, 1.0, 0.05) * np.isfinite(pixels[:, 0]))
-        clock.note("association")
-        centerline = predicted.copy()
-        if len(centres) >= 2:
-            points = triangulate(np.array(projectors), np.array(centres), np.array(weights))
-            good = np.isfinite(points).all(axis=1)
-            centerline[good] = points[good]
-        held = self._fixed
-        centerline[held] = predicted[held]
-        seen = visible.any(axis=0)
-        deviation = np.where(seen, self.config.prediction_uncertainty, uncertainty)
-        clock.note("triangulation")
-        return centerline, visible, deviation
-
-
-class _Clock:
-    """Adds the time since the last note to a component's milliseconds."""
-
-    def __init__(self, timings: dict[str, float]) -> None:
-        self._timings = timings
-        self._last = perf_counter()
-
-    def note(self, component: str) -> None:
-        now = perf_counter()
-        self._timings[component] += 1e3 * (now - self._last)
-        self._last = now
-
-
-def pixels_per_metre(camera: CameraModel, points: Array) -> Array:
-    """Image scale (n,) [pixels/m] at points (n, 3); of a point behind the camera as at 1 mm."""
-    depth = transform_points(camera.T_camera_world, points)[:, 2]
-    return np.sqrt(camera.K[0, 0] * camera.K[1, 1]) / np.maximum(depth, 1e-3)
-
-
-def occupancy_mask(
-    pixels: Array, reach: Array, shape: tuple[int, int]
-) -> tuple[tuple[int, int], NDArray[np.uint8]]:
-    """Where the rod may be (Section V-A1): a band around its projection, cut out of the image.
-
-    Args:
-        pixels: (n, 2) projected centerline; NaN where behind the camera.
-        reach: (n,) half-width of the band at each node [pixels].
-        shape: (height, width) of the image.
-
-    Returns:
-        The cut-out's first (column, row) and its mask (h, w), 1 inside the band.
-    """
-    height, width = shape
-    good = np.isfinite(pixels).min(axis=1)
-    limit = 4.0 * max(height, width)
-    points = np.clip(np.where(good[:, None], pixels, 0.0), -limit, limit)
-    low = np.floor((points - reach[:, None])[good].min(axis=0)).astype(int)
-    high = np.ceil((points + reach[:, None])[good].max(axis=0)).astype(int) + 1
-    first = np.clip(low, 0, [width - 1, height - 1])
-    last = np.clip(high, first + 1, [width, height])
-    mask = np.zeros((last[1] - first[1], last[0] - first[0]), np.uint8)
-    local = np.round(points - first).astype(np.int32)
-    thickness = np.clip(2.0 * reach, 1, limit).astype(int)
-    for i in range(len(points) - 1):
-        if good[i] and good[i + 1]:
-            ends = (local[i].tolist(), local[i + 1].tolist())
-            cv2.line(mask, *ends, 1, int(max(thickness[i], thickness[i + 1])))
-    return (int(first[0]), int(first[1])), mask
+        return Sighting(
+            self._index[name],
+            camera,
+            view.image,
+            graph,
+            self._element_length * scale,
+            reach,
+            float(np.median(radii)),
+        )
 
 
 def _carried(centerline: Array, displacement: BoundaryDisplacement) -> Array:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve
+from scipy.linalg import eigh, solve
 
 from dlo_gym.geometry.camera import CameraModel
 from dlo_gym.geometry.se3 import Array
@@ -23,7 +23,8 @@ from dlo_gym.geometry.se3 import Array
 # Standard deviations [m] of the fit's terms.
 SIGHT_NOISE = 3e-4  # of a seen centerline, across
 BEND_NOISE = 1.2e-4  # second difference of the correction, per squared 10 mm of element length
-LENGTH_NOISE = 3e-5  # of an element's length
+LENGTH_NOISE = 3e-5  # of an element's length, beside the others'
+STRETCH = 0.01  # standard deviation of the whole curve's stretch [-]
 
 
 def ray_projectors(directions: Array) -> Array:
@@ -92,7 +93,7 @@ def fit_curve(
     sights: Sequence[Sight],
     element_length: float,
     uncertainty: Array,
-    fixed: Array,
+    fixed: NDArray[np.bool_],
     *,
     sight_noise: float = SIGHT_NOISE,
     iterations: int = 1,
@@ -160,6 +161,34 @@ class CurveFit(NamedTuple):
         return deviation
 
 
+def bending_modes(
+    curve: Array, element_length: float, fixed: NDArray[np.bool_], count: int, curvature: float
+) -> Array:
+    """Displacements (count, n, 3) [m] in which a curve of given element length bends most easily.
+
+    Each changes the curvature by a root mean square of ``curvature`` [1/m]. To first order they
+    keep the length.
+
+    Args:
+        curve: (n, 3) [m].
+        element_length: [m].
+        fixed: (n,) bool, nodes that stay.
+    """
+    n = len(curve)
+    free = np.flatnonzero(~np.asarray(fixed, dtype=bool))
+    unknown = (3 * free[:, None] + np.arange(3)).ravel()
+    second = np.diff(np.eye(n), n=2, axis=0) / element_length**2
+    matrix = np.zeros((n, 3, n, 3))
+    for axis in range(3):
+        matrix[:, axis, :, axis] = second.T @ second / n
+    _add_lengths(matrix, np.zeros((n, 3)), curve, element_length)
+    reduced = matrix.reshape(3 * n, 3 * n)[np.ix_(unknown, unknown)]
+    stiffness, shapes = eigh(reduced, subset_by_index=(0, min(count, len(unknown)) - 1))
+    modes = np.zeros((len(stiffness), n, 3))
+    modes[:, free] = (curvature / np.sqrt(stiffness) * shapes).T.reshape(-1, len(free), 3)
+    return modes
+
+
 def _bending(n: int, element_length: float) -> Array:
     """D2^T D2 / variance (n, n) of the second difference D2 of a correction."""
     second = np.diff(np.eye(n), n=2, axis=0)
@@ -168,16 +197,27 @@ def _bending(n: int, element_length: float) -> Array:
 
 
 def _add_lengths(matrix: Array, gradient: Array, curve: Array, element_length: float) -> None:
-    """Adds the elements' length terms to matrix (n, 3, n, 3) and gradient (n, 3)."""
+    """Adds the elements' length terms to matrix (n, 3, n, 3) and gradient (n, 3).
+
+    Their errors are independent but for a common stretch, which a soft rod's weight and a length
+    measured along another path give it.
+    """
     edges = np.diff(curve, axis=0)
     lengths = np.linalg.norm(edges, axis=1)
     tangents = edges / np.maximum(lengths, 1e-9)[:, None]
-    pull = ((lengths - element_length) / LENGTH_NOISE**2)[:, None] * tangents
+    variance, common = LENGTH_NOISE**2, (STRETCH * element_length) ** 2
+    share = common / (variance + len(edges) * common)
+    excess = lengths - element_length
+    pull = ((excess - share * excess.sum()) / variance)[:, None] * tangents
     gradient[1:] += pull
     gradient[:-1] -= pull
-    block = tangents[:, :, None] * tangents[:, None, :] / LENGTH_NOISE**2
+    block = tangents[:, :, None] * tangents[:, None, :] / variance
     first, second = np.arange(len(edges)), np.arange(1, len(edges) + 1)
     matrix[first, :, first, :] += block
     matrix[second, :, second, :] += block
     matrix[first, :, second, :] -= block
     matrix[second, :, first, :] -= block
+    total = np.zeros_like(curve)
+    total[1:] += tangents
+    total[:-1] -= tangents
+    matrix -= (share / variance) * total[:, :, None, None] * total

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dlo_gym.geometry.se3 import Array, check_pose, inverse, pose, transform_points
+from dlo_gym.geometry.se3 import Array, check_single_pose, inverse, pose, transform_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class CameraModel:
                 f"camera {self.name!r}: distortion must be 5 finite numbers k1 k2 p1 p2 k3,"
                 f" got {self.distortion}"
             )
-        extrinsics = check_pose(self.T_world_camera, f"camera {self.name!r}: T_world_camera")
+        extrinsics = check_single_pose(self.T_world_camera, f"camera {self.name!r}: T_world_camera")
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "distortion", distortion)
         object.__setattr__(self, "T_world_camera", extrinsics)

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
-from dlo_gym.geometry.se3 import Array
+from dlo_gym.geometry.se3 import Array, frame_along
 
 
 def arc_length(points: ArrayLike) -> Array:
@@ -43,7 +43,8 @@ def parallel_transport(tangents: ArrayLike, first_frame: ArrayLike) -> Array:
     frames = np.empty((len(tangents), 3, 3))
     frame = np.asarray(first_frame, dtype=np.float64)
     for i, tangent in enumerate(tangents):
-        frame = frames[i] = _minimal_rotation(frame[:, 2], tangent) @ frame
+        d1 = _minimal_rotation(frame[:, 2], tangent) @ frame[:, 0]
+        frame = frames[i] = frame_along(tangent, d1)  # orthonormal again: errors cannot grow
     return frames
 
 

@@ -102,3 +102,15 @@ def check_pose(transform: ArrayLike, name: str, tolerance: float = 1e-6) -> Arra
     if np.abs(transform[..., 3, :] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0) > tolerance:
         raise ValueError(f"{name}: expected the last row 0 0 0 1, got {transform[..., 3, :]}")
     return transform
+
+
+def check_single_pose(transform: ArrayLike, name: str) -> Array:
+    """``transform`` as float64 array (4, 4), after checking that it is one rigid transform.
+
+    Raises:
+        ValueError: naming ``name``, on another shape or where ``check_pose`` does.
+    """
+    single = check_pose(transform, name)
+    if single.ndim != 2:
+        raise ValueError(f"{name}: expected one pose of shape (4, 4), got {single.shape}")
+    return single

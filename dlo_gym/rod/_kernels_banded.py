@@ -5,7 +5,6 @@ shape (n_dofs, 9). Only rows and columns ``first <= i < last`` take part; the ot
 rod's prescribed degrees of freedom and keep their coupling columns untouched.
 """
 
-import numpy as np
 from numba import njit
 
 HALF_BANDWIDTH = 8
@@ -80,7 +79,3 @@ def shift_diagonal(band, first, last, translation, rotation):
     """
     for j in range(first, last):
         band[j, 0] += translation if (j // 3) % 2 == 0 else rotation
-
-
-def empty_band(n_dofs: int) -> np.ndarray:
-    return np.zeros((n_dofs, HALF_BANDWIDTH + 1))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dlo_gym.geometry.se3 import Array, check_pose, exp_so3, log_so3
+from dlo_gym.geometry.se3 import Array, check_single_pose, exp_so3, log_so3
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,17 +17,16 @@ class BoundaryPoses:
     last node free.
 
     Raises:
-        ValueError: if a pose is not rigid.
+        ValueError: if a pose is not (4, 4) or not rigid.
     """
 
     left: Array
     right: Array | None = None
 
     def __post_init__(self) -> None:
-        for side in ("left", "right"):
-            value = getattr(self, side)
-            if value is not None:
-                object.__setattr__(self, side, check_pose(value, f"clamp {side}"))
+        object.__setattr__(self, "left", check_single_pose(self.left, "clamp left"))
+        if self.right is not None:
+            object.__setattr__(self, "right", check_single_pose(self.right, "clamp right"))
 
     @property
     def distance(self) -> float:

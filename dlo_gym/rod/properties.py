@@ -48,6 +48,7 @@ class RodProperties:
                 raise ValueError(
                     f"{name}: expected a positive number or one per element, got {values}"
                 )
+            object.__setattr__(self, name, values if values.ndim else float(values))
         if not -1.0 < self.poisson_ratio <= 0.5:
             raise ValueError(f"poisson_ratio: expected -1 < nu <= 0.5, got {self.poisson_ratio}")
         rest = np.asarray(self.rest_curvature, dtype=np.float64)
@@ -56,6 +57,22 @@ class RodProperties:
                 "rest_curvature: expected finite values of shape (3,) or (n_elements - 1, 3),"
                 f" got shape {rest.shape}"
             )
+
+    def check_n_elements(self, n_elements: int) -> None:
+        """Check that a rod of ``n_elements`` can have these properties.
+
+        Raises:
+            ValueError: naming the property that has another number of values.
+        """
+        for name in ("radius", "youngs_modulus", "density"):
+            shape = np.shape(getattr(self, name))
+            if shape not in ((), (n_elements,)):
+                raise ValueError(
+                    f"{name}: expected one value per element, {n_elements}, got {shape[0]}"
+                )
+        rest = np.shape(self.rest_curvature)
+        if len(rest) == 2 and rest[0] != n_elements - 1:
+            raise ValueError(f"rest_curvature: expected {n_elements - 1} rows, got {rest[0]}")
 
     @property
     def area(self) -> float | Array:
@@ -93,13 +110,6 @@ class RodProperties:
         return self.density * self.area
 
 
-def per_element(values: ArrayLike, n_elements: int, name: str) -> Array:
-    """A scalar or (n_elements,) property as an array (n_elements,).
-
-    Raises:
-        ValueError: naming the property, if it has another number of values.
-    """
-    values = np.asarray(values, dtype=np.float64)
-    if values.ndim and values.shape != (n_elements,):
-        raise ValueError(f"{name}: expected one value per element, {n_elements}, got {len(values)}")
-    return np.ascontiguousarray(np.broadcast_to(values, n_elements))
+def per_element(values: ArrayLike, n_elements: int) -> Array:
+    """A scalar or (n_elements,) property as an array (n_elements,)."""
+    return np.ascontiguousarray(np.broadcast_to(values, n_elements), dtype=np.float64)

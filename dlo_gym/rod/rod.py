@@ -40,7 +40,8 @@ class CosseratRod:
             to the continuous rod with second order in n.
 
     Raises:
-        ValueError: if a per-element property has another number of values.
+        ValueError: naming the argument, or the per-element property that has another number of
+            values.
     """
 
     def __init__(
@@ -51,13 +52,16 @@ class CosseratRod:
         gravity: ArrayLike = GRAVITY,
         clamp: Literal["element", "node"] = "element",
     ) -> None:
-        if n_elements < 2:
-            raise ValueError(f"n_elements: expected at least 2, got {n_elements}")
+        if not isinstance(n_elements, int | np.integer) or n_elements < 2:
+            raise ValueError(f"n_elements: expected an integer of at least 2, got {n_elements}")
         if clamp not in ("element", "node"):
             raise ValueError(f"clamp: expected 'element' or 'node', got {clamp!r}")
+        properties.check_n_elements(n_elements)
         self.properties = properties
         self.n_elements = n_elements
         self.gravity = np.asarray(gravity, dtype=np.float64)
+        if self.gravity.shape != (3,) or not np.isfinite(self.gravity).all():
+            raise ValueError(f"gravity: expected three finite numbers [m/s^2], got {gravity}")
         self._arrays = _arrays(properties, n_elements, self.gravity, clamp)
         stiffness = float(self._arrays.bending[:, 0].mean())
         weight = float(np.abs(self._arrays.forces).sum())
@@ -165,7 +169,8 @@ class CosseratRod:
                 self._linearise()
                 raise RodDiverged(
                     f"the equilibrium was lost at {100 * reached:.0f} % of a move by"
-                    f" {np.array2string(vector, precision=4)} [m, rad]: {problem}",
+                    f" {np.array2string(vector, precision=4, max_line_width=200)} [m, rad]:"
+                    f" {problem}",
                     last_good=self.state,
                 )
             done, stride = reached, full_stride
@@ -309,7 +314,7 @@ class CosseratRod:
         voronoi = self._arrays.voronoi_length[1:-1]
         bend = float((np.linalg.norm(curvature, axis=1) * voronoi).max())
         if not bend < LARGEST_BEND:
-            return f"neighbouring elements bend by {bend:.2g} rad, beyond {LARGEST_BEND}"
+            return f"neighbouring elements bend by {bend:.2g} rad, beyond {LARGEST_BEND:.2g}"
         return ""
 
     def _wrenches(self) -> Array:
@@ -329,17 +334,15 @@ def _arrays(
     """The kernels' constants: element values, and their averages at the nodes between."""
     rest_length = np.full(n, properties.length / n)
     shear = np.column_stack(
-        [per_element(properties.shearing_stiffness, n, "radius, youngs_modulus")] * 2
-        + [per_element(properties.stretching_stiffness, n, "radius, youngs_modulus")]
+        [per_element(properties.shearing_stiffness, n)] * 2
+        + [per_element(properties.stretching_stiffness, n)]
     )
-    bend = per_element(properties.bending_stiffness, n, "radius, youngs_modulus")
-    twist = per_element(properties.twisting_stiffness, n, "radius, youngs_modulus")
+    bend = per_element(properties.bending_stiffness, n)
+    twist = per_element(properties.twisting_stiffness, n)
     elements = np.column_stack([bend, bend, twist])
     # Two half elements in series: the harmonic mean of their stiffnesses.
     between = 2.0 / (1.0 / elements[:-1] + 1.0 / elements[1:])
     rest = np.asarray(properties.rest_curvature, dtype=np.float64)
-    if rest.ndim == 2 and len(rest) != n - 1:
-        raise ValueError(f"rest_curvature: expected {n - 1} rows, got {len(rest)}")
     rest = np.broadcast_to(rest, (n - 1, 3))
     joint = (RIGID_JOINT if clamp == "element" else 0.5) * properties.length / n
     voronoi = np.full(n + 1, properties.length / n)
@@ -356,7 +359,7 @@ def _arrays(
 
 def _weight(properties: RodProperties, n: int, gravity: Array) -> Array:
     """(n + 1, 3) weight of each node [N]: half of the elements beside it."""
-    mass = per_element(properties.linear_density, n, "radius, density") * properties.length / n
+    mass = per_element(properties.linear_density, n) * properties.length / n
     nodes = np.zeros(n + 1)
     nodes[:-1] += 0.5 * mass
     nodes[1:] += 0.5 * mass

@@ -56,6 +56,8 @@ class ShapeEstimate:
         stamp: time of the images [s].
         seen: False if no view contributed and the centerline is the prediction alone.
         message: why a view or the whole update fell back to the prediction; empty if none did.
+        timings_ms: time of the update by component [ms], with their sum as "total"; empty when the
+            shape does not come from images.
     """
 
     centerline: Array

@@ -4,9 +4,9 @@ import pytest
 
 from dlo_gym.geometry import View
 from tests.tracking.drawing import draw_cable
+from tracking.projection import pixels_per_metre
 from tracking.ridge import best_path, ridge_strength, straighten
 from tracking.segmentation import ColourSegmenter
-from tracking.tracker import pixels_per_metre
 
 LOOKS = {
     "red on grey": ((200, 60, 50), (150, 152, 148)),
@@ -110,3 +110,17 @@ def test_the_ridge_is_found_beside_a_stronger_edge():
     strip = straighten(image, curve, 3.0, 40.0)
     path = best_path(ridge_strength(strip), (False, False), 1.0)
     np.testing.assert_allclose(np.abs(strip.offsets[path]), 8.5, atol=1.5)
+
+
+def test_a_starker_cable_beside_it_is_not_learnt(cameras, hanging):
+    camera = cameras[1]
+    view = draw_cable(camera, hanging, colour=(70, 100, 75))
+    shift = np.linspace(-0.006, 0.008, len(hanging))[:, None] * np.array([0.0, 1.0, 0.0])
+    points = np.round(16 * camera.project(hanging + shift)).astype(np.int32)
+    image = view.image.copy()
+    cv2.polylines(image, [points], False, (250, 220, 20), 3, cv2.LINE_AA, 4)
+    segmenter, ok = fit(View(image, camera), hanging, uncertainty=12.0)
+    assert ok
+    assert segment(segmenter, view)[true_mask(camera, hanging, 1)].mean() > 0.9
+    yellow = View(np.full_like(image, (250, 220, 20)), camera)
+    assert not segment(segmenter, yellow).any()

@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 
@@ -7,7 +8,8 @@ from dlo_gym.rod import BoundaryDisplacement, BoundaryPoses, RodProperties
 from dlo_gym.rod.rod import CosseratRod
 from tests.tracking.drawing import LENGTH, N_NODES, clamps, draw_cable
 from tracking.predictors import RodPredictor, make_predictor
-from tracking.tracker import MultiViewTracker, TrackerConfig, occupancy_mask
+from tracking.projection import occupancy_mask
+from tracking.tracker import MultiViewTracker, TrackerConfig
 
 MOVES = [(0.0, 0.0), (0.01, 0.05), (0.02, 0.1), (0.03, 0.15), (0.03, 0.2)]
 
@@ -102,6 +104,42 @@ def test_a_rod_of_other_stiffness_than_assumed_is_found(motion, cameras, youngs_
     wrong = RodProperties(length=LENGTH, youngs_modulus=youngs_modulus)
     errors, _ = follow(start(motion, cameras, wrong), motion)
     assert errors[1:].mean() < 1e-3
+
+
+def test_another_cable_where_the_rod_is_expected_is_not_the_rod(cameras, properties):
+    true = RodProperties(LENGTH, youngs_modulus=1e7, rest_curvature=(2.5, 2.5, 0.0))
+    rod = CosseratRod(true)
+    poses = [boundary_at(step) for step in range(len(MOVES))]
+    shapes = [rod.settle(pose).positions for pose in poses]
+    lying = CosseratRod(properties).settle(poses[0]).positions[12:38]  # where it is expected
+    views = []
+    for shape in shapes:
+        views.append([draw_cable(camera, shape, colour=(95, 100, 120)) for camera in cameras[:2]])
+        for view in views[-1]:
+            points = np.round(16 * view.camera.project(lying)).astype(np.int32)
+            cv2.polylines(view.image, [points], False, (250, 220, 20), 3, cv2.LINE_AA, 4)
+    tracker = MultiViewTracker(RodPredictor(properties), cameras[:2])
+    tracker.initialise(poses[0], properties)
+    errors, _ = follow(tracker, (poses, shapes, views))
+    assert errors.mean() < 1e-3
+    assert errors[-1].max() < 4e-3
+
+
+def test_looks_are_not_guessed_before_the_rod_is_found(motion, cameras, properties):
+    poses, shapes, views = motion
+    tracker = start(motion, cameras, properties)
+    rng = np.random.default_rng(0)
+    empty = [
+        View(rng.normal(150, 4, view.image.shape).astype(np.uint8), view.camera)
+        for view in views[0]
+    ]
+    estimate = tracker.update(empty, BoundaryDisplacement.zero(), 0.0)
+    assert not estimate.seen
+    for camera in cameras:
+        assert f"view '{camera.name}': nothing in it looks like the rod" in estimate.message
+    np.testing.assert_allclose(estimate.centerline, shapes[0], atol=1e-4)
+    estimate = tracker.update(views[1], poses[0].displacement_to(poses[1]), 0.1)
+    assert np.linalg.norm(estimate.centerline - shapes[1], axis=1).mean() < 5e-4
 
 
 def test_hidden_nodes_are_told_and_bridged(motion, cameras, properties):

@@ -5,7 +5,13 @@ from hypothesis import strategies as st
 
 from dlo_gym.geometry import CameraModel
 from dlo_gym.geometry.curves import arc_length
-from tracking.triangulation import fit_curve, ray_projectors, sight_across, triangulate
+from tracking.triangulation import (
+    bending_modes,
+    fit_curve,
+    ray_projectors,
+    sight_across,
+    triangulate,
+)
 
 DISTORTION = (-0.2, 0.05, 1e-3, -5e-4, 0.01)
 
@@ -155,3 +161,30 @@ def test_without_sights_the_prediction_stays(curve):
     truth, _, fixed, h = curve
     fit = fit_curve(truth, truth, [], h, np.full(len(truth), 0.01), fixed)
     np.testing.assert_allclose(fit.centerline, truth, atol=1e-6)
+
+
+def test_a_rod_stretched_by_its_weight_is_not_forced_to_its_length(curve):
+    truth, predicted, fixed, h = curve
+    cameras = ring(2)
+    sights = sights_of(cameras, truth, [np.ones(len(truth), dtype=bool)] * 2)
+    uncertainty = np.full(len(truth), 0.01)
+    fit = fit_curve(predicted, predicted, sights, h / 1.01, uncertainty, fixed, iterations=4)
+    error = np.linalg.norm(fit.centerline - truth, axis=1)
+    assert error.max() < 1e-3
+    assert arc_length(fit.centerline)[-1] == pytest.approx(arc_length(truth)[-1], rel=2e-3)
+
+
+def test_modes_bend_without_stretching_or_moving_the_clamps():
+    truth = arc()
+    n, h = len(truth), 0.4 / 40
+    fixed = np.isin(np.arange(n), [0, 1, n - 2, n - 1])
+    modes = bending_modes(truth, h, fixed, 6, curvature=2.0)
+    assert modes.shape == (6, n, 3)
+    assert (modes[:, fixed] == 0.0).all()
+    tangents = np.diff(truth, axis=0) / h
+    stretch = (np.diff(modes, axis=1) * tangents).sum(axis=2) / h
+    assert np.abs(stretch).max() < 0.02
+    curvature = np.diff(modes, n=2, axis=1) / h**2
+    np.testing.assert_allclose(np.sqrt((curvature**2).sum(axis=(1, 2)) / n), 2.0, rtol=0.1)
+    gram = modes.reshape(6, -1) @ modes.reshape(6, -1).T
+    assert np.abs(gram - np.diag(np.diag(gram))).max() < 1e-9

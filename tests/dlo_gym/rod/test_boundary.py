@@ -30,7 +30,7 @@ def test_ten_thousand_moves_keep_the_clamps_rigid():
     for _ in range(10_000):
         poses = poses.displaced(BoundaryDisplacement.from_vector(rng.uniform(-0.1, 0.1, 12)))
     error = poses.left[:3, :3].T @ poses.left[:3, :3] - np.eye(3)
-    assert np.abs(error).max() < 1e-12
+    assert np.abs(error).max() < 2e-15  # without the correction 1e-14 and growing
 
 
 def test_without_axial_rotation_leaves_nothing_about_d3():
@@ -48,6 +48,8 @@ def test_bad_displacements_and_poses_are_named():
         BoundaryDisplacement.from_vector(np.zeros(7))
     with pytest.raises(ValueError, match="clamp right.*rigid"):
         BoundaryPoses(np.eye(4), 2 * np.eye(4))
+    with pytest.raises(ValueError, match=r"clamp left.*one pose of shape \(4, 4\)"):
+        BoundaryPoses(np.tile(np.eye(4), (2, 1, 1)))
     one_armed = BoundaryPoses(pose(np.eye(3), np.zeros(3)))
     with pytest.raises(ValueError, match="right clamp"):
         one_armed.displaced(BoundaryDisplacement.zero())

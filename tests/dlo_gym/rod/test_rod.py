@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from dlo_gym.exceptions import RodDiverged
 from dlo_gym.geometry.se3 import exp_so3, frame_along, pose
 from dlo_gym.rod import BoundaryDisplacement, BoundaryPoses, CosseratRod, RodProperties
 from dlo_gym.rod.initial_shapes import hanging, random_boundary
@@ -177,12 +178,38 @@ def test_overstretching_is_refused_with_both_lengths():
         ({"length": 0.5, "youngs_modulus": np.nan}, "youngs_modulus"),
         ({"length": 0.5, "poisson_ratio": 0.7}, "poisson_ratio"),
         ({"length": 0.5, "rest_curvature": (0.0, 1.0)}, "rest_curvature"),
-        ({"length": 0.5, "density": np.ones(7)}, "density"),
+        ({"length": 0.5, "density": np.ones(7)}, "density: .* 50, got 7"),
+        ({"length": 0.5, "radius": np.ones(50), "density": np.ones(7)}, "density: .* 50, got 7"),
+        ({"length": 0.5, "rest_curvature": np.ones((50, 3))}, "rest_curvature: .* 49 rows, got 50"),
     ],
 )
 def test_impossible_properties_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         CosseratRod(RodProperties(**options), 50)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"n_elements": 2.5}, "n_elements"),
+        ({"n_elements": 1}, "n_elements"),
+        ({"gravity": (0.0, -9.81)}, "gravity"),
+        ({"gravity": (0.0, 0.0, np.nan)}, "gravity"),
+        ({"clamp": "edge"}, "clamp"),
+    ],
+)
+def test_impossible_arguments_are_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        CosseratRod(RodProperties(LENGTH), **options)
+
+
+def test_properties_per_element_may_be_a_list():
+    listed = RodProperties(LENGTH, youngs_modulus=[1e6] * 50, density=[1e3] * 50)
+    boundary = random_boundary(np.random.default_rng(0), LENGTH)
+    np.testing.assert_array_equal(
+        CosseratRod(listed).settle(boundary).positions,
+        CosseratRod(RodProperties(LENGTH)).settle(boundary).positions,
+    )
 
 
 def test_asking_before_settling_says_what_to_do():
@@ -200,3 +227,38 @@ def test_starting_curve_has_the_length_and_leaves_along_the_clamps(seed):
     steps = np.linalg.norm(np.diff(curve, axis=0), axis=1)
     assert abs(steps.sum() - LENGTH) < 0.05 * LENGTH
     np.testing.assert_allclose(curve[0], boundary.left[:3, 3], atol=1e-12)
+
+
+def test_a_wrong_shape_is_refused_and_the_rod_stays_as_it_was(monkeypatch):
+    rod = settled(3)
+    before = rod.state
+    displacement = random_step(np.random.default_rng(3), 4.0)
+    after = rod.move(displacement)
+    rod.restore(before)
+    # A limit on the bend between elements that the start keeps and the end does not.
+    bends = [np.linalg.norm(state.curvature, axis=1).max() / 100 for state in (before, after)]
+    monkeypatch.setattr("dlo_gym.rod.rod.LARGEST_BEND", np.mean(bends))
+    if bends[0] > bends[1]:
+        rod.restore(after)
+        displacement, before = displacement.scaled(-1.0), after
+    with pytest.raises(
+        RodDiverged, match=r"lost at \d+ % of a move by.*elements bend by"
+    ) as caught:
+        rod.move(displacement)
+    np.testing.assert_array_equal(rod.state.positions, before.positions)
+    np.testing.assert_array_equal(caught.value.last_good.positions, before.positions)
+    assert rod.state.energy == before.energy
+
+
+def test_divergence_is_not_judged_by_finite_values_alone():
+    rod = settled(4)
+    start = rod.state.positions
+    broken = start + np.random.default_rng(0).normal(scale=0.3, size=start.shape)
+    try:
+        state = rod.settle(rod.state.boundary, start=broken)
+    except RodDiverged:
+        np.testing.assert_array_equal(rod.state.positions, start)
+    else:  # whatever was found is a rod: whole, smooth and in balance
+        assert np.abs(state.strain).max() < 0.05
+        weight = 9.81 * rod.properties.linear_density * LENGTH
+        assert abs(state.wrench_left[2] + state.wrench_right[2] - weight) < 1e-7
