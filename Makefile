@@ -34,7 +34,7 @@ lint: $(VENV)/.all
 	$(BIN)/lint-imports
 
 clean:
-	rm -rf $(VENV) out runs build *.egg-info .pytest_cache .ruff_cache .import_linter_cache
+	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Setting up -------------------------------------------------------------------------------------

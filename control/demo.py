@@ -23,10 +23,12 @@ from control.evaluate import (
 )
 from control.report import EpisodeVideo, plot_episode, side_by_side, write_page
 from dlo_gym.envs.shape_env import ShapeControlEnv
+from dlo_gym.output_folder import check_output_folder, replace_folder
 from dlo_gym.overlay import draw_overlay
 from dlo_gym.recording import RecordingWriter
 
 ENVIRONMENT = "dlo_gym/ShapeControlTracked-v0"
+MADE = ("report.html", "views.mp4", "views.png", "plots.png", "metrics.json", "recording")
 
 
 def demo(
@@ -44,7 +46,8 @@ def demo(
     """Steer a cable to a goal shape, seeing it only through two rendered cameras.
 
     One episode of model predictive control on tracked observations. Leaves a folder with
-    report.html, a video of both views, plots, metrics.json and the recording.
+    report.html, a video of both views, plots, metrics.json and the recording; Ctrl-C ends the
+    episode early and reports the steps made.
 
     Args:
         out: folder to make.
@@ -55,12 +58,14 @@ def demo(
         clutter: put industrial parts and other cables into the scene.
         quality: of the rendering; high has shadows and antialiasing and takes several times longer.
         model: what the MPC plans on: the trained surrogate, or the rod itself.
-        overwrite: replace ``out`` if it exists.
+        overwrite: replace the output folder if it exists and holds nothing but a former report.
     """
-    if out.exists() and not overwrite:
-        raise FileExistsError(f"{out} exists; pass --overwrite to replace it")
+    out = out.resolve()
+    check_output_folder(out, MADE, overwrite=overwrite)
     if steps < 1:
         raise ValueError(f"steps: expected at least 1, got {steps}")
+    if seed < 0:
+        raise ValueError(f"seed: expected 0 or more, got {seed}")
     if not 90 <= image_height <= 2160:
         raise ValueError(f"image_height: expected 90 to 2160 pixels, got {image_height}")
     console = Console()
@@ -82,6 +87,7 @@ def demo(
         controller = make_controller("mpc", gate.limits, cell_env.config, model=model)
         partial.mkdir(parents=True)
         made: list[Step] = []
+        interrupted = False
         poster: NDArray[np.uint8] | None = None
         progress = Progress(
             TextColumn("{task.description}"),
@@ -111,9 +117,9 @@ def demo(
                         f" {1e3 * step.tracking_ptp3d:4.1f} mm",
                     )
             except KeyboardInterrupt:
-                console.print("interrupted; reporting the steps made so far", style="yellow")
+                interrupted = True
         if poster is None:
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt("before the first step; nothing was written")
         imageio.imwrite(partial / "views.png", poster)
         metrics = episode_metrics(made) | {"seed": seed, "environment": ENVIRONMENT}
         write_metrics(partial / "metrics.json", metrics)
@@ -125,16 +131,18 @@ def demo(
             video="views.mp4",
             picture="views.png",
             plots=["plots.png"],
-            command=f"dlo demo --seed {seed} --steps {steps}",
+            command=f"dlo demo --seed {seed} --steps {steps} --image-height {image_height}"
+            f" --occluders {occluders} --{'' if clutter else 'no-'}clutter --quality {quality}"
+            f" --model {model}",
         )
-        if out.exists():
-            shutil.rmtree(out)
-        os.replace(partial, out)
+        replace_folder(partial, out)
     finally:
         environment.close()
         shutil.rmtree(partial, ignore_errors=True)
     console.print(_summary(metrics))
-    console.print(f"report: {(out / 'report.html').resolve()}", highlight=False, soft_wrap=True)
+    console.print(f"report: {out / 'report.html'}", highlight=False, soft_wrap=True)
+    if interrupted:
+        raise KeyboardInterrupt(f"the report shows the {len(made) - 1} steps made")
 
 
 def _recording(path: Path, env: ShapeControlEnv, seed: int) -> RecordingWriter:

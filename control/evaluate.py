@@ -27,6 +27,7 @@ from dlo_gym.envs.config import ShapeEnvConfig
 from dlo_gym.envs.shape_env import ShapeControlEnv
 from dlo_gym.exceptions import SafetyStop, SolverFailed
 from dlo_gym.geometry.se3 import Array
+from dlo_gym.output_folder import check_output_folder
 from dlo_gym.rod.state import ShapeEstimate
 
 OBSERVERS = {"state": "privileged", "tracked": "tracking.observer:TrackerObserver"}
@@ -234,14 +235,18 @@ def control(
         max_steps: per episode; the environment's time limit when omitted.
         policy: file of the trained policy, for rl.
         out: folder for metrics.json.
-        overwrite: write into ``out`` even if it exists.
+        overwrite: replace the metrics.json of a former run in the output folder.
     """
     if episodes < 1:
         raise ValueError(f"episodes: expected at least 1, got {episodes}")
+    if seed < 0:
+        raise ValueError(f"seed: expected 0 or more, got {seed}")
     if max_steps is not None and max_steps < 1:
         raise ValueError(f"max_steps: expected at least 1, got {max_steps}")
-    if out.exists() and not overwrite:
-        raise FileExistsError(f"{out} exists; pass --overwrite to write into it")
+    if policy is not None and controller != "rl":
+        raise ValueError(f"policy: the {controller} controller takes none; pass --controller rl")
+    check_output_folder(out, ("metrics.json*",), overwrite=overwrite)
+    existed = out.exists()
     finished: list[list[Step]] = []
     environment = make_env(env, observer)
     try:
@@ -266,9 +271,12 @@ def control(
                 finished.append(steps)
                 progress.advance(task)
                 write_metrics(out / "metrics.json", settings | overall_metrics(finished))
+    except KeyboardInterrupt:
+        kept = f"{out / 'metrics.json'} has {len(finished)}" if finished else "none was finished"
+        raise KeyboardInterrupt(f"of {episodes} episodes, {kept}") from None
     finally:
         environment.close()
-        if not finished and out.is_dir() and not any(out.iterdir()):
+        if not finished and not existed and out.is_dir():
             out.rmdir()
     console.print(_table(overall_metrics(finished), seed))
     console.print(f"written: {out / 'metrics.json'}", highlight=False)

@@ -1,10 +1,7 @@
 """``dlo train-rl``: soft actor-critic with hindsight experience replay."""
 
 import json
-import os
-import shutil
 import signal
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -15,18 +12,17 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 import dlo_gym  # noqa: F401  registers the environments
 from control.controller import ControlDiagnostics, Controller
-from control.evaluate import gate_for, run_episode
-from control.policy import N_CLAMPS, N_POINTS, Policy, PolicyController, feature_map, sample_points
-from dlo_gym.envs import tasks
+from control.evaluate import gate_for, run_episode, write_metrics
+from control.policy import Policy, PolicyController, feature_map
+from control.policy_env import PolicyObservation
 from dlo_gym.envs.actions import ClampAction
-from dlo_gym.exceptions import DloError, MissingExtra
+from dlo_gym.exceptions import MissingExtra
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.properties import RodProperties
@@ -38,12 +34,12 @@ try:
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.logger import configure
     from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+    from control.rl_checkpoints import load_checkpoint, prepare_folder, save_checkpoint
 except ImportError as error:
     raise MissingExtra("stable-baselines3", "train") from error
 
 ENV_IDS = {"state": "dlo_gym/ShapeControl-v0", "tracked": "dlo_gym/ShapeControlTracked-v0"}
-REWARD_UNIT = 0.02  # mean point error that costs 1 per step [m]
-FAILURE_COST = 20.0
 # Seeds of episodes that no training episode shares: to choose the best policy, to report it.
 VALIDATION_SEED, TEST_SEED = 1_000_000, 2_000_000
 
@@ -70,6 +66,8 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         if self.observer not in ENV_IDS:
             raise ValueError(f"observer: expected state or tracked, got {self.observer!r}")
+        if self.seed < 0:
+            raise ValueError(f"seed: expected 0 or more, got {self.seed}")
         if not 0.0 < self.discount < 1.0:
             raise ValueError(f"discount: expected 0 < gamma < 1, got {self.discount}")
         for name in ("learning_rate", "batch_size", "gradient_steps"):
@@ -137,7 +135,7 @@ def train_rl(
         checkpoint_every: environment steps between checkpoints.
         threads: of torch.
         resume: go on from the newest checkpoint in the output folder.
-        overwrite: delete an output folder that exists.
+        overwrite: replace an output folder that holds nothing but a former training.
     """
     config = TrainingConfig(
         observer, seed, goal_distance, hidden, learning_rate, batch_size, discount,
@@ -152,14 +150,14 @@ def train_rl(
             raise ValueError(f"{name}: expected at least 1, got {value}")
     console = Console()
     torch.set_num_threads(threads)
-    _prepare_folder(out, config, resume, overwrite)
     env = PolicyObservation(gym.make(ENV_IDS[observer], goal_distance=goal_distance))
     test_env = gym.make(ENV_IDS[observer])
+    prepare_folder(out, asdict(config), resume=resume, overwrite=overwrite)
     action: ClampAction = env.unwrapped.clamp_action  # type: ignore[attr-defined]
 
     if resume:
-        model, best_error = _load_checkpoint(out, env, seed)
-        if model.num_timesteps >= steps:
+        model, best_error = load_checkpoint(out, env, seed)
+        if model.num_timesteps > steps:
             raise ValueError(f"steps: {out} has {model.num_timesteps} already, got {steps}")
     else:
         model, best_error = _new_model(env, config), float("inf")
@@ -175,7 +173,7 @@ def train_rl(
         model.learn(remaining, callback=log, reset_num_timesteps=False, log_interval=10)
         log.finish()
     if interrupted:
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(f"--resume goes on at step {model.num_timesteps}")
 
     seeds = range(TEST_SEED, TEST_SEED + test_episodes)
     results = {
@@ -198,7 +196,7 @@ def train_rl(
     }
     metrics: dict[str, Any] = {name.replace(" ", "_"): score for name, score in scores.items()}
     metrics |= {"steps": model.num_timesteps, "test_seeds": [seeds.start, seeds.stop - 1]}
-    _write_json(out / "metrics.json", metrics)
+    write_metrics(out / "metrics.json", metrics)
     table = Table("", "mean final error", "median", "success", title=f"{test_episodes} episodes")
     for name, score in scores.items():
         table.add_row(
@@ -211,55 +209,6 @@ def train_rl(
     console.print(f"policy: {out / 'policy.safetensors'}")
     env.close()
     test_env.close()
-
-
-class PolicyObservation(gym.Wrapper):
-    """What a policy reads of a shape-control environment: some points and the clamps.
-
-    The reward is the dense one over these points, in finer units.
-    """
-
-    def __init__(self, env: gym.Env) -> None:
-        super().__init__(env)
-        points = spaces.Box(-2.0, 2.0, (3 * N_POINTS,), np.float32)
-        self.observation_space = spaces.Dict(
-            {
-                "observation": spaces.Box(-2.0, 2.0, (N_CLAMPS,), np.float32),
-                "achieved_goal": points,
-                "desired_goal": points,
-            }
-        )
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, NDArray], dict[str, Any]]:
-        observation, _ = self.env.reset(seed=seed, options=options)
-        return self._select(observation), {}
-
-    def step(self, action: Any) -> tuple[dict[str, NDArray], float, bool, bool, dict[str, Any]]:
-        observation, _, terminated, truncated, info = self.env.step(action)
-        selected = self._select(observation)
-        # The replay buffer copies the info with every transition; it needs no more than this.
-        info = {"termination": info["termination"], "is_success": info["is_success"]}
-        reward = self.compute_reward(selected["achieved_goal"], selected["desired_goal"], info)
-        return selected, float(reward), terminated, truncated, info
-
-    def compute_reward(
-        self, achieved_goal: NDArray, desired_goal: NDArray, info: dict | Sequence[dict]
-    ) -> Array:
-        error = tasks.shape_error(achieved_goal, desired_goal)
-        return -error / REWARD_UNIT - FAILURE_COST * tasks.failures(info)
-
-    def _select(self, observation: dict[str, NDArray]) -> dict[str, NDArray]:
-        return {
-            "observation": observation["observation"][-N_CLAMPS:],
-            "achieved_goal": sample_points(observation["achieved_goal"].reshape(-1, 3)).astype(
-                np.float32
-            ),
-            "desired_goal": sample_points(observation["desired_goal"].reshape(-1, 3)).astype(
-                np.float32
-            ),
-        }
 
 
 class LinearFeatures(BaseFeaturesExtractor):
@@ -346,14 +295,14 @@ class TrainingLog(BaseCallback):
         if self.num_timesteps % self.eval_every == 0:
             self._evaluate()
         if self.num_timesteps % self.checkpoint_every == 0:
-            _save_checkpoint(self.model, self.out, self.best_error)  # type: ignore[arg-type]
+            save_checkpoint(self.model, self.out, self.best_error)  # type: ignore[arg-type]
         return True
 
     def finish(self) -> None:
         """The last evaluation and checkpoint, also after an interruption."""
         if not self.interrupted and self.evaluated_at != self.num_timesteps:
             self._evaluate()
-        _save_checkpoint(self.model, self.out, self.best_error)  # type: ignore[arg-type]
+        save_checkpoint(self.model, self.out, self.best_error)  # type: ignore[arg-type]
 
     def _evaluate(self) -> None:
         self.evaluated_at = self.num_timesteps
@@ -393,74 +342,6 @@ def _new_model(env: gym.Env, config: TrainingConfig) -> SAC:
         seed=config.seed,
         device="cpu",
     )
-
-
-def _prepare_folder(out: Path, config: TrainingConfig, resume: bool, overwrite: bool) -> None:
-    if resume:
-        _check_same_run(out, config)
-        return
-    if out.exists() and any(out.iterdir()):
-        if not overwrite:
-            raise FileExistsError(f"{out} exists; pass --overwrite to replace it, or --resume")
-        shutil.rmtree(out)
-    out.mkdir(parents=True, exist_ok=True)
-    _write_json(out / "config.json", asdict(config))
-
-
-def _check_same_run(out: Path, config: TrainingConfig) -> None:
-    path = out / "config.json"
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} not found; there is no run to resume in {out}")
-    former = json.loads(path.read_text())
-    asked = json.loads(json.dumps(asdict(config)))
-    changed = [name for name in asked if asked[name] != former.get(name)]
-    if changed:
-        differences = ", ".join(f"{name} {former.get(name)} -> {asked[name]}" for name in changed)
-        raise ValueError(f"--resume: {out} was started with other settings: {differences}")
-
-
-def _save_checkpoint(model: SAC, out: Path, best_error: float) -> None:
-    """Model, replay buffer and score in a folder of their own that appears whole or not at all."""
-    folder = out / f"checkpoint-{model.num_timesteps:09d}"
-    part = folder.with_suffix(".part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir()
-    model.save(part / "model.zip")
-    model.save_replay_buffer(part / "replay_buffer.pkl")
-    _write_json(part / "progress.json", {"best_error": best_error})
-    shutil.rmtree(folder, ignore_errors=True)
-    os.replace(part, folder)
-    for older in _checkpoints(out):
-        if older != folder:
-            shutil.rmtree(older)
-
-
-def _load_checkpoint(out: Path, env: gym.Env, seed: int) -> tuple[SAC, float]:
-    checkpoints = _checkpoints(out)
-    if not checkpoints:
-        raise FileNotFoundError(f"no checkpoint-* in {out}; there is nothing to resume")
-    folder = checkpoints[-1]
-    try:
-        model = SAC.load(folder / "model.zip", env=env, device="cpu")
-        with warnings.catch_warnings():
-            # The episode that was under way ends here; SB3 warns that it is cut.
-            warnings.simplefilter("ignore", UserWarning)
-            model.load_replay_buffer(folder / "replay_buffer.pkl", truncate_last_traj=True)
-        best_error = json.loads((folder / "progress.json").read_text())["best_error"]
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise DloError(f"checkpoint {folder} is damaged: {error}") from error
-    model.set_random_seed(seed + model.num_timesteps)
-    return model, float(best_error)
-
-
-def _checkpoints(out: Path) -> list[Path]:
-    return sorted(path for path in out.glob("checkpoint-*") if path.suffix != ".part")
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(content, indent=2) + "\n")
-    part.replace(path)
 
 
 def _progress(console: Console) -> Progress:

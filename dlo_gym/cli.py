@@ -42,10 +42,11 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         command = getattr(import_module(module), function)
         tyro.cli(command, prog=f"dlo {name}", args=rest)
-    except (DloError, ValueError, FileExistsError, FileNotFoundError) as error:
+    except (DloError, ValueError, OSError) as error:
         console.print(f"dlo {name}: {error}", style="red", highlight=False, markup=False)
         return 1
-    except KeyboardInterrupt:
-        console.print(f"dlo {name}: interrupted; what was finished is kept", style="yellow")
+    except KeyboardInterrupt as interrupt:
+        kept = str(interrupt) or "what was finished is kept"
+        console.print(f"dlo {name}: interrupted; {kept}", style="yellow", highlight=False)
         return 130
     return 0

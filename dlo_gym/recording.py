@@ -9,7 +9,6 @@ views/<camera>/   000000.jpg or .png, one per sample
 import json
 import os
 import shutil
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,10 +21,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from dlo_gym.exceptions import RecordingError
 from dlo_gym.geometry.camera import CameraModel, View
-from dlo_gym.geometry.se3 import Array, check_pose
-
-SCHEMA = "dlo-recording/1"
-IMAGE_SUFFIXES = (".jpg", ".png")
+from dlo_gym.geometry.se3 import Array, check_single_pose
+from dlo_gym.recording_files import (
+    IMAGE_SUFFIXES,
+    SCHEMA,
+    find_images,
+    positive,
+    positive_or_none,
+    read_cameras,
+    read_description,
+    read_signals,
+    read_truth,
+    required,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,24 +83,24 @@ class Recording:
         """
         root = Path(path)
         description_file = root / "recording.json"
-        description = _read_json(description_file)
-        cameras = _cameras(description, description_file)
-        rod = _entry(description, "rod", dict, description_file)
-        signals = _read_signals(root / "signals.npz", cameras)
+        description = read_description(description_file)
+        cameras = read_cameras(description, description_file)
+        rod = required(description, "rod", dict, description_file)
+        signals = read_signals(root / "signals.npz", cameras)
         n_samples = len(signals["stamps"])
-        truth = _read_truth(root / "truth.npz", n_samples, cameras)
+        truth = read_truth(root / "truth.npz", n_samples, cameras)
         return cls(
-            name=_entry(description, "name", str, description_file),
-            rate_hz=_positive(description, "rate_hz", description_file),
-            rod_length=_positive(rod, "length", description_file),
-            rod_radius=_positive(rod, "radius", description_file),
+            name=required(description, "name", str, description_file),
+            rate_hz=positive(description, "rate_hz", description_file),
+            rod_length=positive(rod, "length", description_file),
+            rod_radius=positive(rod, "radius", description_file),
             cameras=cameras,
             stamps=signals["stamps"],
             clamp_left=signals["clamp_left"],
             clamp_right=signals.get("clamp_right"),
-            image_files={c.name: _image_files(root / "views" / c.name, n_samples) for c in cameras},
-            youngs_modulus=_positive_or_none(rod, "youngs_modulus", description_file),
-            density=_positive_or_none(rod, "density", description_file),
+            image_files={c.name: find_images(root / "views" / c.name, n_samples) for c in cameras},
+            youngs_modulus=positive_or_none(rod, "youngs_modulus", description_file),
+            density=positive_or_none(rod, "density", description_file),
             camera_stamps={
                 c.name: signals[f"stamps_{c.name}"]
                 for c in cameras
@@ -265,12 +273,12 @@ class RecordingWriter:
         centerline: ArrayLike | None,
         visible: ArrayLike | None,
     ) -> dict[str, Any]:
-        sample: dict[str, Any] = {"clamp_left": check_pose(clamp_left, "clamp_left")}
+        sample: dict[str, Any] = {"clamp_left": check_single_pose(clamp_left, "clamp_left")}
         if not np.isfinite(stamp):
             raise ValueError(f"stamp: expected a finite time [s], got {stamp}")
         sample["stamps"] = float(stamp)
         if clamp_right is not None:
-            sample["clamp_right"] = check_pose(clamp_right, "clamp_right")
+            sample["clamp_right"] = check_single_pose(clamp_right, "clamp_right")
         if centerline is not None:
             nodes = np.array(centerline, dtype=np.float64)
             if nodes.ndim != 2 or nodes.shape[1] != 3 or not np.isfinite(nodes).all():
@@ -287,8 +295,7 @@ class RecordingWriter:
             for camera, row in zip(self.cameras, mask, strict=True):
                 sample[f"visible_{camera.name}"] = row
         if self._samples:
-            first = {k: np.shape(v) for k, v in self._samples[0].items() if k in _SAMPLE_KEYS}
-            this = {k: np.shape(v) for k, v in sample.items() if k in _SAMPLE_KEYS}
+            first, this = _shapes(self._samples[0]), _shapes(sample)
             if first != this:
                 raise ValueError(f"sample: expected the data of the first, {first}, got {this}")
         return sample
@@ -301,6 +308,18 @@ class RecordingWriter:
         if not self._samples:
             shutil.rmtree(self._folder, ignore_errors=True)
             return
+        try:
+            self._write_arrays()
+        except OSError as error:
+            raise OSError(
+                f"{self.path} could not be completed: {error}; its images are in {self._folder}"
+            ) from error
+        if self.path.exists():
+            raise FileExistsError(f"{self.path} appeared meanwhile; the data is in {self._folder}")
+        os.replace(self._folder, self.path)
+
+    def _write_arrays(self) -> None:
+        """Everything but the images; those of a sample that was not completed go."""
         keys = self._samples[0].keys()
         stacked = {key: np.stack([sample[key] for sample in self._samples]) for key in keys}
         truth = {k: v for k, v in stacked.items() if k == "centerline" or k.startswith("visible_")}
@@ -310,12 +329,9 @@ class RecordingWriter:
             np.savez(self._folder / "truth.npz", allow_pickle=False, **truth)
         (self._folder / "recording.json").write_text(json.dumps(self._description, indent=1))
         for folder in (self._folder / "views").iterdir():
-            for file in folder.iterdir():  # images of a sample that was not completed
+            for file in folder.iterdir():
                 if int(file.stem) >= len(self._samples):
                     file.unlink()
-        if self.path.exists():
-            raise FileExistsError(f"{self.path} appeared meanwhile; the data is in {self._folder}")
-        os.replace(self._folder, self.path)
 
     def __enter__(self) -> "RecordingWriter":
         return self
@@ -329,170 +345,6 @@ class RecordingWriter:
         self.close()
 
 
-_SAMPLE_KEYS = ("clamp_left", "clamp_right", "centerline")
-
-
-def _read_json(file: Path) -> dict[str, Any]:
-    try:
-        description = json.loads(file.read_text())
-    except FileNotFoundError:
-        raise RecordingError(f"{file}: expected this file, it is missing") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise RecordingError(f"{file}: expected a JSON object, got {error}") from error
-    if not isinstance(description, dict):
-        raise RecordingError(f"{file}: expected a JSON object, got {type(description).__name__}")
-    if description.get("schema") != SCHEMA:
-        raise RecordingError(
-            f"{file}: expected schema {SCHEMA!r}, got {description.get('schema')!r}"
-        )
-    return description
-
-
-def _entry(container: dict[str, Any], key: str, kind: type, file: Path) -> Any:
-    if not isinstance(container, dict) or not isinstance(container.get(key), kind):
-        got = container.get(key) if isinstance(container, dict) else container
-        raise RecordingError(f"{file}: expected {key!r} to be a {kind.__name__}, got {got!r}")
-    return container[key]
-
-
-def _positive(container: dict[str, Any], key: str, file: Path) -> float:
-    value = container.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise RecordingError(f"{file}: expected {key!r} to be a number, got {value!r}")
-    if not (np.isfinite(value) and value > 0):
-        raise RecordingError(f"{file}: expected {key!r} to be finite and positive, got {value!r}")
-    return float(value)
-
-
-def _positive_or_none(container: dict[str, Any], key: str, file: Path) -> float | None:
-    return None if container.get(key) is None else _positive(container, key, file)
-
-
-def _cameras(description: dict[str, Any], file: Path) -> tuple[CameraModel, ...]:
-    entries = _entry(description, "cameras", list, file)
-    if not entries:
-        raise RecordingError(f"{file}: expected at least one camera, got none")
-    cameras = []
-    for entry in entries:
-        name = _entry(entry, "name", str, file)
-        if Path(name).name != name or name in ("", ".", ".."):
-            raise RecordingError(f"{file}: expected a camera name fit for a folder, got {name!r}")
-        try:
-            cameras.append(
-                CameraModel(
-                    name,
-                    _entry(entry, "width", int, file),
-                    _entry(entry, "height", int, file),
-                    np.array(_entry(entry, "K", list, file), dtype=np.float64),
-                    np.array(_entry(entry, "T_world_camera", list, file), dtype=np.float64),
-                    np.array(_entry(entry, "distortion", list, file), dtype=np.float64),
-                )
-            )
-        except (TypeError, ValueError) as error:
-            raise RecordingError(f"{file}: camera {name!r}: {error}") from error
-    names = [camera.name for camera in cameras]
-    if len(set(names)) != len(names):
-        raise RecordingError(f"{file}: expected cameras with distinct names, got {names}")
-    return tuple(cameras)
-
-
-def _read_npz(file: Path) -> dict[str, NDArray[Any]]:
-    try:
-        with np.load(file, allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
-    except FileNotFoundError:
-        raise RecordingError(f"{file}: expected this file, it is missing") from None
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-        raise RecordingError(f"{file}: expected an npz of plain arrays, got {error}") from error
-
-
-def _array(
-    arrays: dict[str, NDArray[Any]], key: str, shape: tuple[int | None, ...], file: Path
-) -> Array:
-    """``arrays[key]`` as float64 after checking its shape; None in ``shape`` fits any length."""
-    wanted = "(" + ", ".join("n" if size is None else str(size) for size in shape) + ")"
-    if key not in arrays:
-        raise RecordingError(f"{file}: expected array {key!r} of shape {wanted}, it is missing")
-    value = arrays[key]
-    fits = len(value.shape) == len(shape) and all(
-        size is None or size == got for size, got in zip(shape, value.shape, strict=True)
-    )
-    if not fits or not (np.issubdtype(value.dtype, np.number) or value.dtype == bool):
-        raise RecordingError(
-            f"{file}: expected {key!r} to be numbers of shape {wanted},"
-            f" got {value.dtype} {value.shape}"
-        )
-    if not np.isfinite(value).all():
-        raise RecordingError(f"{file}: expected {key!r} to be finite, got NaN or infinity")
-    return np.ascontiguousarray(value, dtype=np.float64)
-
-
-def _read_signals(file: Path, cameras: tuple[CameraModel, ...]) -> dict[str, Array]:
-    arrays = _read_npz(file)
-    signals = {"stamps": _array(arrays, "stamps", (None,), file)}
-    n_samples = len(signals["stamps"])
-    if n_samples == 0:
-        raise RecordingError(f"{file}: expected at least one sample in 'stamps', got none")
-    for key in ("clamp_left", "clamp_right"):
-        if key == "clamp_left" or key in arrays:
-            poses = _array(arrays, key, (n_samples, 4, 4), file)
-            try:
-                signals[key] = check_pose(poses, key)
-            except ValueError as error:
-                raise RecordingError(f"{file}: {error}") from error
-    for camera in cameras:
-        key = f"stamps_{camera.name}"
-        if key in arrays:
-            signals[key] = _array(arrays, key, (n_samples,), file)
-    return signals
-
-
-def _read_truth(
-    file: Path, n_samples: int, cameras: tuple[CameraModel, ...]
-) -> dict[str, NDArray[Any]]:
-    if not file.exists():
-        return {}
-    arrays = _read_npz(file)
-    truth: dict[str, NDArray[Any]] = {
-        "centerline": _array(arrays, "centerline", (n_samples, None, 3), file)
-    }
-    n_nodes = truth["centerline"].shape[1]
-    if n_nodes < 2:
-        raise RecordingError(f"{file}: expected 'centerline' of two nodes or more, got {n_nodes}")
-    for camera in cameras:
-        key = f"visible_{camera.name}"
-        if key in arrays:
-            if arrays[key].dtype != bool:
-                raise RecordingError(
-                    f"{file}: expected {key!r} to be bool, got {arrays[key].dtype}"
-                )
-            truth[key] = _array(arrays, key, (n_samples, n_nodes), file).astype(bool)
-    return truth
-
-
-def _image_files(folder: Path, n_samples: int) -> tuple[Path, ...]:
-    if not folder.is_dir():
-        raise RecordingError(f"{folder}: expected a folder of {n_samples} images, it is missing")
-    files: dict[str, Path] = {}
-    for file in sorted(folder.iterdir()):
-        if file.suffix.lower() not in IMAGE_SUFFIXES:
-            continue
-        if file.stem in files:
-            raise RecordingError(
-                f"{file}: expected one image per sample, got {files[file.stem]} too"
-            )
-        files[file.stem] = file
-    wanted = [f"{sample:06d}" for sample in range(n_samples)]
-    missing = [stem for stem in wanted if stem not in files]
-    if missing:
-        raise RecordingError(
-            f"{folder / missing[0]}.jpg or .png: expected an image for each of the {n_samples}"
-            f" samples, {len(missing)} missing"
-        )
-    extra = sorted(set(files) - set(wanted))
-    if extra:
-        raise RecordingError(
-            f"{files[extra[0]]}: expected {n_samples} images numbered from 000000 as signals.npz"
-            f" has samples, got {len(extra)} more"
-        )
-    return tuple(files[stem] for stem in wanted)
+def _shapes(sample: dict[str, Any]) -> dict[str, tuple[int, ...]]:
+    """Of a sample's arrays; every sample has its stamps."""
+    return {key: np.shape(value) for key, value in sample.items() if not key.startswith("stamps")}

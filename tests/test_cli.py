@@ -38,3 +38,20 @@ def test_existing_output_is_refused(capsys, tmp_path):
         assert cli.main([name, "--out", str(tmp_path)]) == 1
         assert "--overwrite" in capsys.readouterr().err
     assert (tmp_path / "kept.txt").read_text() == "mine"
+
+
+def test_a_failing_disk_is_one_message_without_a_traceback(capsys, tmp_path):
+    (tmp_path / "file").touch()
+    assert cli.main(["demo", "--out", str(tmp_path / "file" / "out")]) == 1
+    message = capsys.readouterr().err
+    assert "file" in message
+    assert "Traceback" not in message
+
+
+def test_an_interruption_says_what_is_kept(capsys, monkeypatch):
+    def interrupted():
+        raise KeyboardInterrupt("2 of 3 are kept")
+
+    monkeypatch.setattr("control.demo.demo", interrupted)
+    assert cli.main(["demo"]) == 130
+    assert "interrupted; 2 of 3 are kept" in capsys.readouterr().err

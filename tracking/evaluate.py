@@ -22,6 +22,7 @@ from dlo_gym.geometry.camera import View
 from dlo_gym.geometry.curves import resample
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.metrics import distance_to_centerline, occlusion_ratio, ptp_2d, ptp_3d
+from dlo_gym.output_folder import check_output_folder, replace_folder
 from dlo_gym.overlay import draw_overlay
 from dlo_gym.recording import Recording
 from dlo_gym.rod.boundary import BoundaryPoses
@@ -117,9 +118,9 @@ def track(
     """
     console = Console()
     source = Recording.load(recording)
-    folder = out or Path(f"track-{source.name}")
-    if folder.exists() and not overwrite:
-        raise FileExistsError(f"{folder} exists; pass --overwrite to replace it")
+    folder = (out or Path(f"track-{source.name}")).resolve()
+    made = ("estimate.npz", "metrics.json", "overlay*")
+    check_output_folder(folder, made, overwrite=overwrite)
     occlusion = Occlusion()
     if occlude_seed is not None:
         occlusion = occlude(source, occlude_seed, occlude_share, (occlude_from, occlude_to))
@@ -152,7 +153,7 @@ def track(
         if result.estimates:  # also what was finished before an interruption or a damaged image
             metrics = {**settings, "complete": complete, **evaluate(source, result)}
             _write(partial, result, metrics)
-            _publish(partial, folder)
+            replace_folder(partial, folder)
         else:
             shutil.rmtree(partial, ignore_errors=True)
     console.print(summary(metrics))
@@ -367,15 +368,6 @@ class _Pictures:
 def _write(folder: Path, result: Track, metrics: dict[str, Any]) -> None:
     np.savez(folder / "estimate.npz", centerline=result.centerline, visible=result.visible)
     (folder / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
-
-
-def _publish(partial: Path, folder: Path) -> None:
-    """Moves the finished folder into place, in exchange for an older one."""
-    old = folder.with_name(f".{folder.name}.old-{os.getpid()}")
-    if folder.exists():
-        os.replace(folder, old)
-    os.replace(partial, folder)
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def _times(milliseconds: Sequence[float]) -> dict[str, float]:

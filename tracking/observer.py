@@ -15,28 +15,26 @@ class TrackerObserver:
     """Knows the rod only from the cell's images and clamp poses.
 
     Args:
-        predictor: "network" (the shipped ``ShapePredictor``) or "rod".
+        predictor: "network" (the shipped ``ShapePredictor``, as in the paper), or "rod", which
+            knows the cell's rod exactly.
         triangulation: see ``TrackerConfig``.
-        n_nodes: of the estimated centerline; must be the cell's.
         lost_after: time unseen until ``TrackLost`` [s].
     """
 
     def __init__(
         self,
-        predictor: Literal["network", "rod"] = "rod",
+        predictor: Literal["network", "rod"] = "network",
         triangulation: Literal["curve", "paper"] = "curve",
-        n_nodes: int = 51,
         lost_after: float = 3.0,
     ) -> None:
         self._predictor = check_predictor(predictor)
-        self._n_nodes = n_nodes
         self._config = TrackerConfig(triangulation=triangulation, lost_after=lost_after)
         self._tracker: MultiViewTracker | None = None
 
     def reset(self, cell: "SimulatedCell") -> ShapeEstimate:
         """Learns the rod's looks from the first images and tracks it in them."""
         views = cell.views()
-        predictor = make_predictor(self._predictor, cell.properties, self._n_nodes)
+        predictor = make_predictor(self._predictor, cell.properties, cell.n_nodes)
         self._tracker = MultiViewTracker(
             predictor, [view.camera for view in views], config=self._config
         )

@@ -91,5 +91,8 @@ def make_predictor(name: str, properties: RodProperties, n_nodes: int = 51) -> P
 
     network = ShapePredictor.load()
     if network.n_nodes != n_nodes:
-        raise ValueError(f"predictor: the network has {network.n_nodes} nodes, got {n_nodes}")
+        raise ValueError(
+            f"predictor: the network was trained for {network.n_nodes} nodes, got a rod of"
+            f" {n_nodes}; take predictor='rod' for another number"
+        )
     return network

@@ -87,6 +87,10 @@ class SimulatedCell:
         return self.rod.properties
 
     @property
+    def n_nodes(self) -> int:
+        return self.rod.n_nodes
+
+    @property
     def cameras(self) -> tuple[CameraModel, ...]:
         return tuple(self.scene.cameras)
 

@@ -125,6 +125,8 @@ class ShapeEnvConfig:
             )
         if self.max_stretch >= 1.0:
             raise ValueError(f"max_stretch: expected a fraction below 1, got {self.max_stretch}")
+        if not all(isinstance(camera, CameraModel) for camera in self.cameras):
+            raise ValueError(f"cameras: expected CameraModels, got {self.cameras!r}")
         workspace = np.asarray(self.workspace, dtype=np.float64)
         if workspace.shape != (2, 3) or not (workspace[0] < workspace[1]).all():
             raise ValueError(f"workspace: expected (lowest, highest) corners, got {self.workspace}")

@@ -14,14 +14,16 @@ from dlo_gym.envs.cell import SimulatedCell, sample_occluder_paths
 from dlo_gym.envs.config import ShapeEnvConfig
 from dlo_gym.envs.observers import make_observer
 from dlo_gym.exceptions import TrackLost
+from dlo_gym.geometry.curves import arc_length
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.metrics import occlusion_ratio, ptp_3d
 from dlo_gym.overlay import draw_overlay
-from dlo_gym.rod.boundary import BoundaryDisplacement
+from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.state import ShapeEstimate
 from dlo_gym.scene.builder import SceneConfig, default_cameras
 
 RESET_OPTIONS = ("start", "goal")
+LONGEST_GOAL = 1.05  # of a given goal, in lengths of the rod: what its weight may stretch and noise
 
 
 class ShapeControlEnv(gym.Env):
@@ -82,7 +84,7 @@ class ShapeControlEnv(gym.Env):
     `start_noise`. The goal is the shape that the cable takes after `goal_moves` random motions
     from there, every step of which this environment allows: it can be reached, but it was reached
     on another than the straight way. `reset(options={"start": BoundaryPoses, "goal": centerline})`
-    sets either.
+    sets either; an overstretched goal is refused.
 
     ## Episode End
     Truncation after 100 steps (`gym.make(..., max_episode_steps=...)`). Termination, with the
@@ -160,15 +162,19 @@ class ShapeControlEnv(gym.Env):
                 f" valid options are: {', '.join(RESET_OPTIONS)}"
             )
         config, rng = self.config, self.np_random
+        start, goal = options.get("start"), options.get("goal")
+        if start is not None and (not isinstance(start, BoundaryPoses) or start.right is None):
+            raise ValueError(f"start: expected BoundaryPoses of two clamps, got {start!r}")
+        if goal is not None:
+            goal = _check_goal(goal, config)
         occluders = sample_occluder_paths(rng, self.cell.cameras, config.n_occluders)
-        if "start" in options:
-            self.cell.reset(options["start"], occluders)
+        if start is not None:
+            self.cell.reset(start, occluders)
         else:
             tasks.reset_to_random_start(self.cell, rng, config, occluders)
-        if "goal" in options:
-            self._goal = _check_goal(options["goal"], config.n_nodes)
-        else:
-            self._goal = tasks.sample_goal(self.cell, rng, config).centerline
+        if goal is None:
+            goal = tasks.sample_goal(self.cell, rng, config).centerline
+        self._goal = goal
         self._estimate = self._observer.reset(self.cell)
         return self._observation(), self._info(BoundaryDisplacement.zero(), "")
 
@@ -291,11 +297,19 @@ class ShapeControlEnv(gym.Env):
         }
 
 
-def _check_goal(goal: ArrayLike, n_nodes: int) -> Array:
+def _check_goal(goal: ArrayLike, config: ShapeEnvConfig) -> Array:
     goal = np.array(goal, dtype=np.float64)
-    if goal.shape != (n_nodes, 3) or not np.isfinite(goal).all():
+    if goal.shape != (config.n_nodes, 3) or not np.isfinite(goal).all():
         raise ValueError(
-            f"goal: expected a finite centerline of shape ({n_nodes}, 3), got shape {goal.shape}"
+            f"goal: expected a finite centerline of shape ({config.n_nodes}, 3),"
+            f" got shape {goal.shape}"
+        )
+    length = config.properties.length
+    span, along = float(np.linalg.norm(goal[-1] - goal[0])), float(arc_length(goal)[-1])
+    if span > config.max_stretch * length or along > LONGEST_GOAL * length:
+        raise ValueError(
+            f"goal: overstretched: its ends are {span:.4f} m apart and it is {along:.4f} m long,"
+            f" for a rod of {length:.4f} m with max_stretch {config.max_stretch}"
         )
     return goal
 

@@ -17,7 +17,6 @@ DH_A = np.array([0.0, -0.425, -0.3922, 0.0, 0.0, 0.0])
 DH_D = np.array([0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996])
 DH_ALPHA = np.array([np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0])
 JOINT_LIMIT = 2.0 * np.pi  # every joint turns +-360 degrees
-JOINT_SPEED_LIMIT = np.pi  # [rad/s]
 
 # The gripper holds the rod in line: TCP z points out of the fingers, which close along TCP x.
 # With the clamp's d2 upwards, one finger is above the rod and one below.

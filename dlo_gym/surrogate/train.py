@@ -266,7 +266,12 @@ def train_surrogate(
     else:
         for name in names:
             (out / name).unlink(missing_ok=True)
-    _run(trainer, checkpoint, console)
+    try:
+        _run(trainer, checkpoint, console)
+    except KeyboardInterrupt:
+        if not checkpoint.exists():
+            raise KeyboardInterrupt("no checkpoint had been written yet") from None
+        raise KeyboardInterrupt(f"pass --resume to go on from {checkpoint}") from None
     scores = trainer.score()
     console.print(score_table(scores))
     training = {

@@ -89,7 +89,10 @@ def load_weights(file: Path) -> Weights:
         WeightsError: naming the file, what was expected and what it holds.
     """
     if not file.is_file():
-        raise WeightsError(f"{file}: no such file; expected weights of schema {SCHEMA}")
+        raise WeightsError(
+            f"{file}: no such file; expected weights of schema {SCHEMA}: reinstall dlo-gym for the"
+            " shipped ones, or make them by  dlo rollouts  and  dlo train-surrogate"
+        )
     try:
         with safe_open(file, framework="np") as stored:
             metadata = stored.metadata() or {}

@@ -1,10 +1,12 @@
 """The demo end to end, short and small: real rendering, tracking, control, report."""
 
 import json
+from pathlib import Path
 
 import pytest
 
 from control.demo import demo
+from control.mpc import ShapeMPC
 from dlo_gym.recording import Recording
 
 
@@ -48,3 +50,33 @@ def test_bad_options_are_named_and_leave_nothing(tmp_path, options, message):
     with pytest.raises(ValueError, match=message):
         demo(out=tmp_path / "out", **options)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_of_other_things_is_not_replaced(tmp_path, monkeypatch):
+    (tmp_path / "thesis.tex").write_text("mine")
+    monkeypatch.chdir(tmp_path)
+    for out in (Path("."), tmp_path):
+        with pytest.raises(FileExistsError, match=r"thesis\.tex"):
+            demo(out=out, steps=1, overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize("finished", [0, 2])
+def test_ctrl_c_reports_the_steps_made(tmp_path, monkeypatch, finished):
+    commands = []
+
+    def interrupted(self, estimate, boundary, goal):
+        if len(commands) == finished:
+            raise KeyboardInterrupt
+        commands.append(control(self, estimate, boundary, goal))
+        return commands[-1]
+
+    control = ShapeMPC.control
+    monkeypatch.setattr(ShapeMPC, "control", interrupted)
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt, match=f"{finished} steps made"):
+        demo(out=out, seed=1, steps=8, image_height=270, clutter=False)
+    assert json.loads((out / "metrics.json").read_text())["steps"] == finished
+    assert len(Recording.load(out / "recording")) == finished + 1
+    assert (out / "report.html").is_file()
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]

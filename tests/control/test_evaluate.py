@@ -85,6 +85,12 @@ def test_metrics_of_an_episode(steps):
     assert metrics["tracking_ptp3d_mm"] == 0.0
 
 
+def test_an_episode_that_ended_early_at_the_goal_is_no_success(steps):
+    ended = [*steps[:-1], replace(steps[-1], termination="collision")]
+    assert steps[-1].success
+    assert not episode_metrics(ended)["success"]
+
+
 def test_metrics_are_plain_json(steps, tmp_path):
     unknown = [replace(step, tracking_ptp3d=float("nan")) for step in steps]
     write_metrics(tmp_path / "metrics.json", overall_metrics([unknown]))
@@ -152,6 +158,29 @@ def test_the_command_writes_a_report_and_refuses_to_overwrite(tmp_path, capsys):
         control(model="rod", episodes=1, max_steps=1, out=out)
     control(model="rod", episodes=1, max_steps=1, out=out, overwrite=True)
     assert len(json.loads((out / "metrics.json").read_text())["episodes"]) == 1
+    (out / "policy.safetensors").touch()
+    with pytest.raises(FileExistsError, match=r"holds policy\.safetensors"):
+        control(model="rod", episodes=1, max_steps=1, out=out, overwrite=True)
+
+
+@pytest.mark.parametrize("finished", [0, 1])
+def test_ctrl_c_keeps_the_finished_episodes(tmp_path, monkeypatch, finished):
+    starts = []
+
+    def interrupted(self, goal, boundary, properties):
+        starts.append(goal)
+        if len(starts) > finished:
+            raise KeyboardInterrupt
+        return reset(self, goal, boundary, properties)
+
+    reset = ShapeMPC.reset
+    monkeypatch.setattr(ShapeMPC, "reset", interrupted)
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt, match="of 3 episodes"):
+        control(model="rod", episodes=3, max_steps=2, out=out)
+    assert out.exists() == bool(finished)
+    if finished:
+        assert len(json.loads((out / "metrics.json").read_text())["episodes"]) == finished
 
 
 def test_bad_requests_are_refused(tmp_path):
@@ -167,4 +196,6 @@ def test_bad_requests_are_refused(tmp_path):
         control(env="CartPole-v1", out=tmp_path / "a")
     with pytest.raises(ValueError, match="episodes"):
         control(episodes=0, out=tmp_path / "b")
+    with pytest.raises(ValueError, match="policy: the mpc controller takes none"):
+        control(policy=tmp_path / "policy.safetensors", out=tmp_path / "c")
     assert list(tmp_path.iterdir()) == []

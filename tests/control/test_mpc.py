@@ -185,6 +185,28 @@ def test_the_cost_is_what_the_weights_say():
     assert problem.cost(plan, shapes) == pytest.approx(expected, rel=1e-12)
 
 
+def test_every_solution_starts_from_the_last_plan_one_step_on(monkeypatch):
+    mpc = ShapeMPC(SurrogateModel(SmoothPredictor(0)), LIMITS)
+    starts, plans = [], []
+
+    def solve(problem, start):
+        starts.append(start.copy())
+        plans.append(ShapeMPC.solve(mpc, problem, start))
+        return plans[-1]
+
+    monkeypatch.setattr(mpc, "solve", solve)
+    boundary = held()
+    centerline = np.linspace(boundary.left[:3, 3], boundary.right[:3, 3], 7)
+    goal = centerline + np.array([0.0, 0.05, 0.02])
+    mpc.reset(goal, boundary, ROD)
+    for _ in range(2):
+        mpc.control(estimate_of(centerline), boundary, goal)
+    assert not starts[0].any()
+    assert_allclose(starts[1][:-1], plans[0].decisions[1:])
+    assert_allclose(starts[1][-1], plans[0].decisions[-1])
+    assert np.abs(plans[0].decisions[1:] - plans[0].decisions[:-1]).max() > 1e-3
+
+
 def test_one_iteration_is_nearly_converged():
     problem, predictor = small_problem()
     mpc = ShapeMPC(SurrogateModel(predictor), LIMITS, problem.config)

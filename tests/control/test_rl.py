@@ -1,4 +1,5 @@
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,8 +12,10 @@ pytest.importorskip("stable_baselines3")
 
 import torch
 
-from control import rl
-from control.policy import PolicyController, sample_points
+from control import policy_env, rl
+from control.policy import PolicyController, feature_map, sample_points
+from control.policy_env import PolicyObservation
+from control.rl_checkpoints import load_checkpoint
 from dlo_gym.cli import main
 from dlo_gym.envs import tasks
 from dlo_gym.exceptions import DloError
@@ -32,7 +35,7 @@ SMALL = {
 
 @pytest.fixture(scope="module")
 def env():
-    env = rl.PolicyObservation(gym.make(rl.ENV_IDS["state"]))
+    env = PolicyObservation(gym.make(rl.ENV_IDS["state"]))
     yield env
     env.close()
 
@@ -83,14 +86,14 @@ def test_the_policy_reads_points_of_the_same_story(env):
     )
     assert batch[0] == reward
     error = tasks.shape_error(inner.cell.rod_state.positions, inner.goal)
-    assert reward == pytest.approx(-error / rl.REWARD_UNIT, rel=0.2)
+    assert reward == pytest.approx(-error / policy_env.REWARD_UNIT, rel=0.2)
 
 
 def test_a_failure_costs_in_relabelled_transitions_too(env):
     observation, _ = env.reset(seed=0)
     points = np.stack([observation["achieved_goal"]] * 2)
     rewards = env.compute_reward(points, points, [{"termination": "overstretch"}, {}])
-    np.testing.assert_allclose(rewards, [-rl.FAILURE_COST, 0.0])
+    np.testing.assert_allclose(rewards, [-policy_env.FAILURE_COST, 0.0])
 
 
 def test_the_exported_policy_is_the_actors_mean(env):
@@ -113,7 +116,7 @@ def test_features_are_the_same_in_torch(env):
     observation, _ = env.reset(seed=0)
     extractor = rl.LinearFeatures(env.observation_space)
     tensors = {key: torch.as_tensor(value)[None] for key, value in observation.items()}
-    matrix, offset = rl.feature_map()
+    matrix, offset = feature_map()
     keys = ("achieved_goal", "desired_goal", "observation")
     inputs = np.concatenate([observation[key] for key in keys])
     np.testing.assert_allclose(extractor(tensors)[0], matrix @ inputs + offset, atol=1e-4)
@@ -131,6 +134,16 @@ def test_a_run_leaves_policy_scores_and_checkpoint(trained):
     PolicyController(trained / "policy.safetensors")
 
 
+def test_a_worse_policy_does_not_replace_the_best(trained, tmp_path):
+    shutil.copytree(trained, tmp_path / "run")
+    (newest,) = (tmp_path / "run").glob("checkpoint-*")
+    (newest / "progress.json").write_text('{"best_error": 0.0}')
+    best = (trained / "policy.safetensors").read_bytes()
+    rl.train_rl(tmp_path / "run", **SMALL | {"steps": 145}, resume=True)
+    assert len((tmp_path / "run" / "evaluations.jsonl").read_text().splitlines()) == 3
+    assert (tmp_path / "run" / "policy.safetensors").read_bytes() == best
+
+
 def test_holding_still_keeps_the_start_error(env):
     inner_env = gym.make(rl.ENV_IDS["state"])
     _, info = inner_env.reset(seed=11)
@@ -146,8 +159,15 @@ def test_an_output_folder_is_not_overwritten_unasked(trained, capsys):
     assert (trained / "policy.safetensors").is_file()
 
 
+def test_a_folder_of_other_things_is_not_deleted(tmp_path):
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"thesis\.tex"):
+        rl.train_rl(tmp_path, **SMALL, overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
 def test_resume_goes_on_with_model_and_replay_buffer(trained, env):
-    model, best_error = rl._load_checkpoint(trained, env, seed=0)
+    model, best_error = load_checkpoint(trained, env, seed=0)
     assert model.num_timesteps == 140
     assert model.replay_buffer.size() == 140
     assert 0.0 < best_error < 0.5
@@ -156,8 +176,15 @@ def test_resume_goes_on_with_model_and_replay_buffer(trained, env):
     rl.train_rl(trained, **SMALL | {"steps": 160}, resume=True)
     assert json.loads((trained / "metrics.json").read_text())["steps"] == 160
     assert [path.name for path in trained.glob("checkpoint*")] == ["checkpoint-000000160"]
-    with pytest.raises(ValueError, match="has 160 already, got 160"):
-        rl.train_rl(trained, **SMALL | {"steps": 160}, resume=True)
+    with pytest.raises(ValueError, match="has 160 already, got 150"):
+        rl.train_rl(trained, **SMALL | {"steps": 150}, resume=True)
+
+
+def test_a_run_interrupted_in_its_last_test_is_finished_by_resume(trained):
+    before = json.loads((trained / "metrics.json").read_text())
+    (trained / "metrics.json").unlink()
+    rl.train_rl(trained, **SMALL | {"steps": before["steps"]}, resume=True)
+    assert json.loads((trained / "metrics.json").read_text()) == before
 
 
 def test_resume_refuses_other_settings_and_empty_folders(trained, tmp_path):
@@ -177,6 +204,8 @@ def test_resume_refuses_other_settings_and_empty_folders(trained, tmp_path):
         ("buffer_size", 50),
         ("hidden", ()),
         ("test_episodes", 0),
+        ("seed", -1),
+        ("goal_distance", (0.2, 0.1)),
     ],
 )
 def test_a_bad_setting_is_refused_by_name_before_anything_is_written(name, value, tmp_path):
@@ -190,21 +219,30 @@ def test_a_damaged_checkpoint_is_named(tmp_path, env):
     folder.mkdir()
     (folder / "model.zip").write_bytes(b"not a zip")
     with pytest.raises(DloError, match="checkpoint-000000010 is damaged"):
-        rl._load_checkpoint(tmp_path, env, seed=0)
+        load_checkpoint(tmp_path, env, seed=0)
 
 
-def test_ctrl_c_keeps_a_checkpoint_to_resume_from(tmp_path, monkeypatch):
+def test_a_damaged_replay_buffer_is_named(trained, tmp_path, env):
+    (newest,) = trained.glob("checkpoint-*")
+    shutil.copytree(newest, tmp_path / newest.name)
+    (tmp_path / newest.name / "replay_buffer.pkl").write_bytes(b"not a pickle")
+    with pytest.raises(DloError, match=f"{newest.name} is damaged"):
+        load_checkpoint(tmp_path, env, seed=0)
+
+
+@pytest.mark.parametrize("step", [5, 90])  # before and after the first evaluation
+def test_ctrl_c_keeps_a_checkpoint_to_resume_from(tmp_path, monkeypatch, step):
     on_step = rl.TrainingLog._on_step
 
-    def interrupted_at_90(log):
-        if log.num_timesteps == 90:
+    def interrupted(log):
+        if log.num_timesteps == step:
             signal.raise_signal(signal.SIGINT)
         return on_step(log)
 
-    monkeypatch.setattr(rl.TrainingLog, "_on_step", interrupted_at_90)
+    monkeypatch.setattr(rl.TrainingLog, "_on_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         rl.train_rl(tmp_path / "run", **SMALL)
-    assert [p.name for p in (tmp_path / "run").glob("checkpoint*")] == ["checkpoint-000000090"]
+    assert [p.name for p in (tmp_path / "run").glob("checkpoint*")] == [f"checkpoint-{step:09d}"]
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     monkeypatch.undo()
     rl.train_rl(tmp_path / "run", **SMALL, resume=True)

@@ -3,6 +3,7 @@ import os
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -222,6 +223,44 @@ def test_a_sample_that_does_not_fit_is_refused_and_not_added(tmp_path):
             with pytest.raises(ValueError, match=named):
                 writer.append(**given)
     assert len(Recording.load(tmp_path / "rec")) == 1
+
+
+def test_a_sample_without_the_truth_of_the_first_is_refused(tmp_path):
+    views = [View(np.zeros((c.height, c.width, 3), np.uint8), c) for c in CAMERAS]
+    line, seen = np.zeros((5, 3)), np.ones((2, 5), dtype=bool)
+    with RecordingWriter(
+        tmp_path / "rec", CAMERAS, rod_length=0.5, rod_radius=0.003, rate_hz=10
+    ) as writer:
+        writer.append(views, np.eye(4), None, 0.0, centerline=line, visible=seen)
+        for truth in ({}, {"centerline": line}, {"centerline": line[1:], "visible": seen[:, 1:]}):
+            with pytest.raises(ValueError, match="data of the first"):
+                writer.append(views, np.eye(4), None, 0.1, **truth)
+    assert len(Recording.load(tmp_path / "rec")) == 1
+
+
+def test_images_of_a_sample_that_was_not_completed_go(tmp_path, monkeypatch):
+    views = [View(np.zeros((c.height, c.width, 3), np.uint8), c) for c in CAMERAS]
+    writer = RecordingWriter(tmp_path / "rec", CAMERAS, rod_length=0.5, rod_radius=0.003, rate_hz=1)
+    imwrite = cv2.imwrite
+    monkeypatch.setattr(
+        cv2, "imwrite", lambda f, *rest: "top/000001" not in f and imwrite(f, *rest)
+    )
+    with writer:
+        writer.append(views, np.eye(4), None, 0.0)
+        with pytest.raises(OSError, match=r"top/000001\.png.*disk full"):
+            writer.append(views, np.eye(4), None, 1.0)
+    assert len(Recording.load(tmp_path / "rec")) == 1
+
+
+def test_what_cannot_be_completed_is_said_and_kept(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(OSError, match=r"No space left.*images are in"):
+        write(tmp_path / "rec")
+    (kept,) = tmp_path.iterdir()
+    assert len(list(kept.glob("views/side/*.png"))) == T
 
 
 def test_the_shared_recording_loads():

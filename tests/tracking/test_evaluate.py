@@ -75,9 +75,12 @@ def test_an_existing_folder_is_kept_unless_told(drawn, tmp_path, capsys):
     (out / "mine.txt").write_text("precious")
     assert run(drawn / "without", "--out", out, "--overlay", "none") == 1
     assert "--overwrite" in capsys.readouterr().err
-    assert (out / "mine.txt").exists()
+    assert run(drawn / "without", "--out", out, "--overlay", "none", "--overwrite") == 1
+    assert "mine.txt" in capsys.readouterr().err
+    assert (out / "mine.txt").read_text() == "precious"
+    (out / "mine.txt").rename(out / "metrics.json")  # now it could be a former result
     assert run(drawn / "without", "--out", out, "--overlay", "none", "--overwrite") == 0
-    assert (out / "metrics.json").exists()
+    assert (out / "metrics.json").read_text() != "precious"
 
 
 def test_a_damaged_image_is_reported_and_what_was_tracked_is_kept(tmp_path, cameras, capsys):
@@ -120,6 +123,8 @@ def test_patches_are_clipped_to_the_image(cameras, hanging):
 class Cell:
     """As much of a simulated cell as the observer may look at."""
 
+    n_nodes = 51
+
     def __init__(self, recording):
         self.recording, self.sample = recording, 0
         self.properties = rod_properties(recording)
@@ -154,6 +159,14 @@ def test_the_observer_tracks_a_cell(drawn, predictor):
     assert estimate.stamp == cell.stamp
     observer.close()
     observer.close()
+
+
+def test_a_rod_that_the_network_does_not_know_is_refused_with_the_way_out(drawn):
+    cell = Cell(Recording.load(drawn / "with_truth"))
+    cell.n_nodes = 31
+    with pytest.raises(ValueError, match="51 nodes, got a rod of 31.*predictor='rod'"):
+        TrackerObserver().reset(cell)
+    assert TrackerObserver("rod").reset(cell).centerline.shape == (31, 3)
 
 
 def tracked(source, occlusion=None):

@@ -47,6 +47,7 @@ def test_an_unknown_option_is_named_and_the_valid_ones_are_listed():
         ("clutter", "office"),
         ("n_occluders", -1),
         ("quality", "best"),
+        ("cameras", ("side",)),
     ],
 )
 def test_a_bad_value_is_refused_by_name(name, value):

@@ -246,6 +246,21 @@ def test_unknown_options_are_refused_with_the_valid_ones(env):
         ShapeControlEnv(render_mode="human")
     with pytest.raises(ValueError, match=r"goal: expected a finite centerline of shape \(51, 3\)"):
         env.reset(options={"goal": np.zeros((10, 3))})
+    with pytest.raises(ValueError, match="start: expected BoundaryPoses of two clamps"):
+        env.reset(options={"start": np.eye(4)})
+
+
+@pytest.mark.parametrize(
+    "goal",
+    [
+        np.linspace([-0.4, 0.0, 0.3], [0.4, 0.0, 0.3], 51),
+        np.tile([[0.0, 0.0, 0.3], [0.1, 0.0, 0.3], [0.2, 0.0, 0.3]], (17, 1)),
+    ],
+    ids=["ends too far apart", "too long in between"],
+)
+def test_an_overstretched_goal_is_refused_with_both_lengths(env, goal):
+    with pytest.raises(ValueError, match=r"goal: overstretched.* a rod of 0\.5000 m"):
+        env.reset(options={"goal": goal})
 
 
 def test_an_overstretched_start_is_refused(env):

@@ -133,6 +133,14 @@ def test_a_clear_rod_is_seen_but_for_an_end_under_its_gripper(plain):
     assert plain.visibility("side")[1:-1].all()
 
 
+def test_a_hidden_occluder_is_not_drawn(plain):
+    plain.update(*hanging(), [[0.0, -30.0, 0.3]])
+    without = plain.render("side").image
+    for hidden in (None, [[np.nan] * 3]):
+        plain.update(*hanging(), hidden)
+        np.testing.assert_array_equal(plain.render("side").image, without)
+
+
 def test_a_panel_hides_the_nodes_that_project_onto_it(plain):
     positions, boundary = hanging()
     camera = plain.config.cameras[0]
