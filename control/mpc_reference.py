@@ -58,6 +58,14 @@ def solve_with_ipopt(
             "ipopt.sb": "yes",
             "ipopt.max_iter": max_iterations,
             "ipopt.tol": 1e-8,
+            # On a kink of the ReLU network no gradient vanishes: there, stop when the cost stands.
+            "ipopt.acceptable_tol": 1e10,
+            "ipopt.acceptable_dual_inf_tol": 1e10,
+            "ipopt.acceptable_compl_inf_tol": 1e-4,
+            "ipopt.acceptable_constr_viol_tol": 1e-8,
+            "ipopt.acceptable_obj_change_tol": 1e-4,
+            "ipopt.acceptable_iter": 5,
+            "ipopt.mu_init": 1e-5,
             "print_time": False,
         },
     )

@@ -385,8 +385,9 @@ def test_senseless_settings_are_refused(field, value):
 
 
 @pytest.mark.slow
-def test_the_shipped_surrogate_agrees_with_ipopt(surrogate):
-    _, state, goal = goal_and_start(3)
+@pytest.mark.parametrize("seed", range(4))
+def test_the_shipped_surrogate_agrees_with_ipopt(surrogate, seed):
+    _, state, goal = goal_and_start(seed)
     n = len(goal)
     problem = ShapeProblem(
         centerline=state.positions,
