@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Literal
 
@@ -23,6 +24,7 @@ from control.evaluate import (
 )
 from control.report import EpisodeVideo, plot_episode, side_by_side, write_page
 from dlo_gym.envs.shape_env import ShapeControlEnv
+from dlo_gym.interrupts import deferred_interrupt
 from dlo_gym.output_folder import check_output_folder, replace_folder
 from dlo_gym.overlay import draw_overlay
 from dlo_gym.recording import RecordingWriter
@@ -80,14 +82,15 @@ def demo(
         goal_distance=(0.06, 0.12),
     )
     partial = out.with_name(f".{out.name}.part-{os.getpid()}")
-    try:
+    with deferred_interrupt() as interrupt, ExitStack() as stack:
+        stack.callback(environment.close)
+        stack.callback(shutil.rmtree, partial, ignore_errors=True)
         cell_env = environment.unwrapped
         assert isinstance(cell_env, ShapeControlEnv)
         gate = gate_for(cell_env.config)
         controller = make_controller("mpc", gate.limits, cell_env.config, model=model)
         partial.mkdir(parents=True)
         made: list[Step] = []
-        interrupted = False
         poster: NDArray[np.uint8] | None = None
         progress = Progress(
             TextColumn("{task.description}"),
@@ -102,24 +105,23 @@ def demo(
             progress,
         ):
             task = progress.add_task("starting the cell", total=steps)
-            try:
-                for step in run_episode(environment, controller, gate, seed=seed):
-                    made.append(step)
-                    _record(recording, cell_env, step)
-                    image = _picture(cell_env, step)
-                    video.append(image)
-                    if poster is None or step.shape_error > 0.5 * made[0].shape_error:
-                        poster = image
-                    progress.update(
-                        task,
-                        completed=len(made) - 1,
-                        description=f"shape {1e3 * step.shape_error:6.1f} mm   tracking"
-                        f" {1e3 * step.tracking_ptp3d:4.1f} mm",
-                    )
-            except KeyboardInterrupt:
-                interrupted = True
-        if poster is None:
-            raise KeyboardInterrupt("before the first step; nothing was written")
+            for step in run_episode(environment, controller, gate, seed=seed):
+                made.append(step)
+                _record(recording, cell_env, step)
+                image = _picture(cell_env, step)
+                video.append(image)
+                if poster is None or step.shape_error > 0.5 * made[0].shape_error:
+                    poster = image
+                progress.update(
+                    task,
+                    completed=len(made) - 1,
+                    description=f"shape {1e3 * step.shape_error:6.1f} mm   tracking"
+                    f" {1e3 * step.tracking_ptp3d:4.1f} mm",
+                )
+                if interrupt.requested:
+                    break
+            progress.update(task, description="writing the report")
+        assert poster is not None
         imageio.imwrite(partial / "views.png", poster)
         metrics = episode_metrics(made) | {"seed": seed, "environment": ENVIRONMENT}
         write_metrics(partial / "metrics.json", metrics)
@@ -136,12 +138,9 @@ def demo(
             f" --model {model}",
         )
         replace_folder(partial, out)
-    finally:
-        environment.close()
-        shutil.rmtree(partial, ignore_errors=True)
     console.print(_summary(metrics))
-    console.print(f"report: {out / 'report.html'}", highlight=False, soft_wrap=True)
-    if interrupted:
+    console.print(f"report: {out / 'report.html'}", highlight=False, soft_wrap=True, markup=False)
+    if interrupt.requested:
         raise KeyboardInterrupt(f"the report shows the {len(made) - 1} steps made")
 
 

@@ -46,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
         console.print(f"dlo {name}: {error}", style="red", highlight=False, markup=False)
         return 1
     except KeyboardInterrupt as interrupt:
-        kept = str(interrupt) or "what was finished is kept"
-        console.print(f"dlo {name}: interrupted; {kept}", style="yellow", highlight=False)
+        said = f"; {interrupt}" if str(interrupt) else ""
+        console.print(f"dlo {name}: interrupted{said}", style="yellow", markup=False)
         return 130
     return 0

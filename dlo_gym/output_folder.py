@@ -23,17 +23,17 @@ def check_output_folder(out: Path, made: Iterable[str], *, overwrite: bool) -> N
         return
     if not out.is_dir():
         raise FileExistsError(f"{out} is a file; name a folder")
-    if not overwrite:
-        raise FileExistsError(f"{out} exists; pass --overwrite to replace it")
     patterns = tuple(made)
     names = sorted(entry.name for entry in out.iterdir())
     foreign = [name for name in names if not any(fnmatch(name, pattern) for pattern in patterns)]
     if foreign:
         more = f" and {len(foreign) - 3} more" if len(foreign) > 3 else ""
         raise FileExistsError(
-            f"{out} holds {', '.join(foreign[:3])}{more}, which this command did not make, so it is"
-            " not replaced; name another folder"
+            f"{out} exists and holds {', '.join(foreign[:3])}{more}, which this command did not"
+            " make; name another folder (--overwrite replaces former results only)"
         )
+    if not overwrite:
+        raise FileExistsError(f"{out} exists; pass --overwrite to replace it")
 
 
 def replace_folder(finished: Path, out: Path) -> None:

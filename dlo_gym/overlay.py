@@ -93,13 +93,13 @@ def draw_overlay(
     if goal is not None:
         draw_centerline(image, view.camera, goal, GOAL, thickness=3.0)
         entries.append(("goal", GOAL))
-    if truth is not None:
-        draw_centerline(image, view.camera, truth, TRUE, thickness=5.0)
-        entries.append(("true", TRUE))
     if estimate is not None:
-        draw_centerline(image, view.camera, estimate, SEEN, thickness=2.0, visible=visible)
+        draw_centerline(image, view.camera, estimate, SEEN, thickness=5.0, visible=visible)
         entries.append(("tracked, seen" if visible is not None else "tracked", SEEN))
         if visible is not None:
             entries.append(("tracked, hidden", HIDDEN))
+    if truth is not None:
+        draw_centerline(image, view.camera, truth, TRUE, thickness=1.5)
+        entries.append(("true", TRUE))
     draw_legend(image, entries)
     return image

@@ -261,7 +261,8 @@ class RecordingWriter:
             sample[f"stamps_{camera.name}"] = float(view.stamp)
             file = self._folder / "views" / camera.name / f"{index:06d}{self._suffix}"
             image = cv2.cvtColor(view.image, cv2.COLOR_RGB2BGR)
-            if not cv2.imwrite(str(file), image, [cv2.IMWRITE_JPEG_QUALITY, 95]):
+            options = [cv2.IMWRITE_JPEG_QUALITY, 95] if self._suffix == ".jpg" else []
+            if not cv2.imwrite(str(file), image, options):
                 raise OSError(f"{file}: the image could not be written; is the disk full?")
         self._samples.append(sample)
 

@@ -1,17 +1,21 @@
-"""The README's Python example runs as it stands."""
+"""The Python examples of the README and the docs run as they stand."""
 
 import re
 from pathlib import Path
 
+import pytest
+
 README = Path(__file__).parent.parent / "README.md"
 
 
-def test_python_examples_run(tmp_path, monkeypatch):
+@pytest.mark.parametrize("page", ["README.md", "docs/rod.md", "docs/control.md"])
+def test_python_examples_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    examples = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
+    text = (README.parent / page).read_text()
+    examples = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
     assert examples
     for example in examples:
-        exec(compile(example, "README.md", "exec"), {})
+        exec(compile(example, page, "exec"), {})
 
 
 def test_pictures_and_documents_it_names_exist():

@@ -21,6 +21,7 @@ from dlo_gym.exceptions import TrackLost
 from dlo_gym.geometry.camera import View
 from dlo_gym.geometry.curves import resample
 from dlo_gym.geometry.se3 import Array
+from dlo_gym.interrupts import deferred_interrupt
 from dlo_gym.metrics import distance_to_centerline, occlusion_ratio, ptp_2d, ptp_3d
 from dlo_gym.output_folder import check_output_folder, replace_folder
 from dlo_gym.overlay import draw_overlay
@@ -33,6 +34,7 @@ from tracking.occlusion import Patch, paste, random_patches
 from tracking.predictors import make_predictor
 from tracking.tracker import COMPONENTS, MultiViewTracker, TrackerConfig
 
+OCCLUSION = (0.4, 0.2, 0.7)  # share of nodes hidden; from, to: shares of the duration
 VIDEO_WIDTH = 960  # of each view [pixels]
 PATCH_SIZE = 80 / 1920  # of the image width
 N_PICTURES = 5
@@ -90,9 +92,9 @@ def track(
     predictor: Literal["network", "rod"] = "rod",
     triangulation: Literal["curve", "paper"] = "curve",
     occlude_seed: int | None = None,
-    occlude_share: float = 0.4,
-    occlude_from: float = 0.2,
-    occlude_to: float = 0.7,
+    occlude_share: float = OCCLUSION[0],
+    occlude_from: float = OCCLUSION[1],
+    occlude_to: float = OCCLUSION[2],
     youngs_modulus: float | None = None,
     overlay: Literal["video", "pictures", "none"] = "video",
     overwrite: bool = False,
@@ -105,7 +107,7 @@ def track(
 
     Args:
         recording: folder in the format dlo-recording/1.
-        out: folder to make; track-<name of the recording> if omitted.
+        out: folder to make; out/track-<name of the recording> if omitted.
         predictor: how the shape follows the grippers between images.
         triangulation: "curve" (the default) or the paper's, node by node.
         occlude_seed: paste opaque patches over all views, in the layout of this seed.
@@ -118,11 +120,22 @@ def track(
     """
     console = Console()
     source = Recording.load(recording)
-    folder = (out or Path(f"track-{source.name}")).resolve()
+    folder = (out or Path("out") / f"track-{source.name}").resolve()
     made = ("estimate.npz", "metrics.json", "overlay*")
     check_output_folder(folder, made, overwrite=overwrite)
     occlusion = Occlusion()
-    if occlude_seed is not None:
+    if occlude_seed is None:
+        if (occlude_share, occlude_from, occlude_to) != OCCLUSION:
+            raise ValueError(
+                "occlude_share, occlude_from, occlude_to: they say how --occlude-seed hides the"
+                " cable; give that too"
+            )
+    elif occlude_seed < 0 or not 0.0 < occlude_share < 1.0:
+        raise ValueError(
+            "occlude_seed, occlude_share: expected a seed of 0 or more and a share between 0 and 1,"
+            f" got {occlude_seed} and {occlude_share}"
+        )
+    else:
         occlusion = occlude(source, occlude_seed, occlude_share, (occlude_from, occlude_to))
     config = TrackerConfig(triangulation=triangulation)
     properties = rod_properties(source, youngs_modulus)
@@ -132,7 +145,7 @@ def track(
         "predictor": predictor,
         "triangulation": triangulation,
         "occlude_seed": occlude_seed,
-        "occluded_samples": [occlusion.first, occlusion.last],
+        "occluded_range": [occlusion.first, occlusion.last],
     }
     partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
     shutil.rmtree(partial, ignore_errors=True)
@@ -140,24 +153,31 @@ def track(
     result = Track()
     pictures = _Pictures(partial, source, overlay)
     metrics: dict[str, Any] = {}
-    complete = False
-    try:
-        with Progress(console=console, transient=True) as progress:
-            task = progress.add_task("tracking", total=len(source))
-            for views in follow(tracker, source, properties, result, occlusion):
-                pictures.add(views, result, len(result.estimates) - 1)
-                progress.advance(task)
-        complete = True
-    finally:
-        pictures.close()
-        if result.estimates:  # also what was finished before an interruption or a damaged image
-            metrics = {**settings, "complete": complete, **evaluate(source, result)}
-            _write(partial, result, metrics)
-            replace_folder(partial, folder)
-        else:
+    with deferred_interrupt() as interrupt:
+        try:
+            with Progress(console=console, transient=True) as progress:
+                task = progress.add_task("tracking", total=len(source))
+                for views in follow(tracker, source, properties, result, occlusion):
+                    pictures.add(views, result, len(result.estimates) - 1)
+                    progress.advance(task)
+                    if interrupt.requested:
+                        break
+                progress.update(task, description="writing the video")
+                pictures.close()
+        finally:  # what was finished before an interruption or a damaged image is kept
+            pictures.close()
+            complete = len(result.estimates) == len(source)
+            if result.estimates and (complete or not folder.exists()):
+                metrics = {**settings, "complete": complete, **evaluate(source, result)}
+                _write(partial, result, metrics)
+                replace_folder(partial, folder)
             shutil.rmtree(partial, ignore_errors=True)
+    if not metrics:
+        raise KeyboardInterrupt(f"the former result in {folder} stays")
     console.print(summary(metrics))
-    console.print(f"written to {folder}", highlight=False)
+    console.print(f"written to {folder}", highlight=False, markup=False, soft_wrap=True)
+    if not complete:
+        raise KeyboardInterrupt(f"{len(result.estimates)} of {len(source)} samples were tracked")
 
 
 def rod_properties(source: Recording, youngs_modulus: float | None = None) -> RodProperties:
@@ -186,6 +206,8 @@ def make_tracker(
     config: TrackerConfig | None = None,
 ) -> MultiViewTracker:
     """A tracker for a recording's cameras, with as many nodes as its truth has, 51 without."""
+    if predictor == "network" and source.clamp_right is None:
+        raise ValueError("predictor: the network knows no rod held by one gripper; take 'rod'")
     n_nodes = 51 if source.centerline is None else source.centerline.shape[1]
     model = make_predictor(predictor, properties, n_nodes)
     return MultiViewTracker(model, source.cameras, config=config)
@@ -361,8 +383,10 @@ class _Pictures:
             cv2.imwrite(str(file), cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
 
     def close(self) -> None:
+        """Finishes the video; does nothing the second time."""
         if self._video is not None:
             self._video.close()
+            self._video = None
 
 
 def _write(folder: Path, result: Track, metrics: dict[str, Any]) -> None:

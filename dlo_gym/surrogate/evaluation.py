@@ -89,7 +89,7 @@ def boundary(positions: Array, clamps: Array) -> BoundaryPoses:
 
 def score_table(scores: list[Score]) -> Table:
     """For the terminal."""
-    table = Table("steps", "moves", "PTP3D mean [mm]", "p95 [mm]", "worst node [mm]", "motion [mm]")
+    table = Table("steps", "moves", "mean", "p95", "worst node", "motion", title="PTP3D in mm")
     for s in scores:
         values = (s.mean_mm, s.p95_mm, s.max_node_mm, s.motion_mm)
         table.add_row(str(s.n_steps), str(s.n_moves), *(f"{value:.3f}" for value in values))

@@ -1,10 +1,12 @@
 """The demo end to end, short and small: real rendering, tracking, control, report."""
 
 import json
+import signal
 from pathlib import Path
 
 import pytest
 
+import control.demo
 from control.demo import demo
 from control.mpc import ShapeMPC
 from dlo_gym.recording import Recording
@@ -67,16 +69,28 @@ def test_ctrl_c_reports_the_steps_made(tmp_path, monkeypatch, finished):
 
     def interrupted(self, estimate, boundary, goal):
         if len(commands) == finished:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
         commands.append(control(self, estimate, boundary, goal))
         return commands[-1]
 
     control = ShapeMPC.control
     monkeypatch.setattr(ShapeMPC, "control", interrupted)
     out = tmp_path / "out"
-    with pytest.raises(KeyboardInterrupt, match=f"{finished} steps made"):
+    with pytest.raises(KeyboardInterrupt, match=f"{finished + 1} steps made"):
         demo(out=out, seed=1, steps=8, image_height=270, clutter=False)
-    assert json.loads((out / "metrics.json").read_text())["steps"] == finished
-    assert len(Recording.load(out / "recording")) == finished + 1
+    assert json.loads((out / "metrics.json").read_text())["steps"] == finished + 1
+    assert len(Recording.load(out / "recording")) == finished + 2
     assert (out / "report.html").is_file()
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_ctrl_c_while_the_report_is_written_does_not_lose_it(tmp_path, monkeypatch):
+    def interrupted(path, **content):
+        signal.raise_signal(signal.SIGINT)
+        plot(path, **content)
+
+    plot = control.demo.plot_episode
+    monkeypatch.setattr("control.demo.plot_episode", interrupted)
+    with pytest.raises(KeyboardInterrupt, match="2 steps made"):
+        demo(out=tmp_path / "out", seed=1, steps=2, image_height=270, clutter=False)
+    assert (tmp_path / "out" / "report.html").is_file()

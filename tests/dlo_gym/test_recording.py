@@ -9,7 +9,7 @@ import pytest
 
 from dlo_gym.exceptions import RecordingError
 from dlo_gym.geometry import CameraModel, View
-from dlo_gym.overlay import SEEN, draw_overlay
+from dlo_gym.overlay import SEEN, TRUE, draw_overlay
 from dlo_gym.recording import Recording, RecordingWriter
 
 T, N = 4, 7
@@ -282,4 +282,15 @@ def test_the_overlay_draws_on_a_copy_and_survives_what_is_not_in_the_image():
     drawn = draw_overlay(view, line, visible=np.arange(11) < 6, truth=line, goal=line, caption="x")
     assert not view.image.any()
     x, y = np.round(camera.project(line[3])).astype(int)
-    assert np.abs(drawn[y, x].astype(int) - SEEN).max() < 60
+    assert np.abs(drawn[y, x].astype(int) - TRUE).max() < 60
+    assert np.abs(drawn[y + 2, x].astype(int) - SEEN).max() < 60
+
+
+def test_writing_png_prints_nothing(tmp_path, capfd):
+    camera = CameraModel.looking_at("side", (0, -1, 0.4), (0, 0, 0.3), width=32, height=18)
+    view = View(np.zeros((18, 32, 3), np.uint8), camera)
+    with RecordingWriter(
+        tmp_path / "r", [camera], rod_length=0.5, rod_radius=0.003, rate_hz=10.0
+    ) as writer:
+        writer.append([view], np.eye(4), np.eye(4), 0.0)
+    assert "WARN" not in "".join(capfd.readouterr())

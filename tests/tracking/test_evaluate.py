@@ -1,4 +1,5 @@
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from tests.tracking.drawing import LENGTH, RADIUS, clamps, draw_cable
 from tracking.evaluate import Track, evaluate, follow, make_tracker, occlude, rod_properties
 from tracking.observer import TrackerObserver
 from tracking.occlusion import hidden_by, paste, random_patches
+from tracking.tracker import MultiViewTracker
 
 SAMPLES = 6
 
@@ -196,3 +198,21 @@ def test_exp1_under_patches_and_after_them(exp1, seed):
     assert covered.mean() <= 1.0
     assert max(metrics["ptp_3d_mm_per_sample"][occlusion.last + 5 :]) <= 0.5
     assert not metrics["lost"]
+
+
+def test_ctrl_c_keeps_the_samples_tracked_so_far(drawn, tmp_path, monkeypatch, capsys):
+    def interrupted(self, views, displacement, stamp=None):
+        estimate = update(self, views, displacement, stamp)
+        if stamp is not None and stamp > 0.1:
+            signal.raise_signal(signal.SIGINT)
+        return estimate
+
+    update = MultiViewTracker.update
+    monkeypatch.setattr(MultiViewTracker, "update", interrupted)
+    out = tmp_path / "out"
+    assert run(drawn / "with_truth", "--out", out) == 130
+    assert "samples were tracked" in capsys.readouterr().err
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert not metrics["complete"]
+    assert len(np.load(out / "estimate.npz")["centerline"]) == metrics["samples"] < SAMPLES
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
