@@ -279,7 +279,7 @@ def control(
         if not finished and not existed and out.is_dir():
             out.rmdir()
     console.print(_table(overall_metrics(finished), seed))
-    console.print(f"written: {out / 'metrics.json'}", highlight=False)
+    console.print(f"written: {out / 'metrics.json'}", highlight=False, markup=False, soft_wrap=True)
 
 
 def make_env(name: str, observer: str | None = None, **options: Any) -> gym.Env:

@@ -1,12 +1,9 @@
 """``dlo train-rl``: soft actor-critic with hindsight experience replay."""
 
 import json
-import signal
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -24,6 +21,7 @@ from control.policy_env import PolicyObservation
 from dlo_gym.envs.actions import ClampAction
 from dlo_gym.exceptions import MissingExtra
 from dlo_gym.geometry.se3 import Array
+from dlo_gym.interrupts import Interrupt, deferred_interrupt
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.properties import RodProperties
 from dlo_gym.rod.state import ShapeEstimate
@@ -164,15 +162,15 @@ def train_rl(
         export_policy(model, action).save(out / "untrained.safetensors", steps="0", seed=str(seed))
     model.set_logger(configure(str(out / "tensorboard"), ["tensorboard"]))
 
-    with _interruptible() as interrupted, _progress(console) as progress:
+    with deferred_interrupt() as interrupt, _progress(console) as progress:
         log = TrainingLog(
-            out, test_env, action, progress, interrupted, steps, best_error,
+            out, test_env, action, progress, interrupt, steps, best_error,
             eval_every, eval_episodes, checkpoint_every,
         )  # fmt: skip
         remaining = steps - model.num_timesteps
         model.learn(remaining, callback=log, reset_num_timesteps=False, log_interval=10)
         log.finish()
-    if interrupted:
+    if interrupt.requested:
         raise KeyboardInterrupt(f"--resume goes on at step {model.num_timesteps}")
 
     seeds = range(TEST_SEED, TEST_SEED + test_episodes)
@@ -206,7 +204,9 @@ def train_rl(
             f"{100 * score['success_rate']:.0f} %",
         )
     console.print(table)
-    console.print(f"policy: {out / 'policy.safetensors'}")
+    console.print(
+        f"policy: {out / 'policy.safetensors'}", highlight=False, markup=False, soft_wrap=True
+    )
     env.close()
     test_env.close()
 
@@ -273,7 +273,7 @@ class TrainingLog(BaseCallback):
         eval_env: gym.Env,
         action: ClampAction,
         progress: Progress,
-        interrupted: list[int],
+        interrupt: Interrupt,
         steps: int,
         best_error: float,
         eval_every: int,
@@ -282,14 +282,14 @@ class TrainingLog(BaseCallback):
     ) -> None:
         super().__init__()
         self.out, self.eval_env, self.action = out, eval_env, action
-        self.progress, self.interrupted = progress, interrupted
+        self.progress, self.interrupt = progress, interrupt
         self.best_error, self.evaluated_at = best_error, -1
         self.eval_every, self.checkpoint_every = eval_every, checkpoint_every
         self.seeds = range(VALIDATION_SEED, VALIDATION_SEED + eval_episodes)
         self.bar = progress.add_task("training", total=steps, note="")
 
     def _on_step(self) -> bool:
-        if self.interrupted:
+        if self.interrupt.requested:
             return False
         self.progress.update(self.bar, completed=self.num_timesteps)
         if self.num_timesteps % self.eval_every == 0:
@@ -300,7 +300,7 @@ class TrainingLog(BaseCallback):
 
     def finish(self) -> None:
         """The last evaluation and checkpoint, also after an interruption."""
-        if not self.interrupted and self.evaluated_at != self.num_timesteps:
+        if not self.interrupt.requested and self.evaluated_at != self.num_timesteps:
             self._evaluate()
         save_checkpoint(self.model, self.out, self.best_error)  # type: ignore[arg-type]
 
@@ -349,19 +349,3 @@ def _progress(console: Console) -> Progress:
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
         TimeRemainingColumn(), TextColumn("{task.fields[note]}"), console=console,
     )  # fmt: skip
-
-
-@contextmanager
-def _interruptible() -> Iterator[list[int]]:
-    """Ctrl-C fills the list instead of tearing an update apart; a second one acts as usual."""
-    received: list[int] = []
-
-    def note(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-        signal.signal(signal.SIGINT, former)
-
-    former = signal.signal(signal.SIGINT, note)
-    try:
-        yield received
-    finally:
-        signal.signal(signal.SIGINT, former)

@@ -167,7 +167,7 @@ def rollouts(
             manifest.shards[name] = digest
             manifest.write(out)
             progress.advance(task, len(settings.shard_indices(int(name[6:-4]))))
-    console.print(f"{settings.n_rollouts} rollouts in {out}", highlight=False)
+    console.print(f"{settings.n_rollouts} rollouts in {out}", highlight=False, markup=False)
 
 
 def _open_dataset(out: Path, settings: RolloutSettings, resume: bool, overwrite: bool) -> Manifest:

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from dlo_gym.exceptions import DatasetError, MissingExtra, WeightsError
 from dlo_gym.geometry.se3 import Array, exp_so3, matrix_to_quaternion
+from dlo_gym.interrupts import deferred_interrupt
 from dlo_gym.rod.boundary import BoundaryDisplacement
 from dlo_gym.surrogate.atomic_file import written_aside
 from dlo_gym.surrogate.evaluation import Score, evaluate_predictor, score_table
@@ -266,12 +267,7 @@ def train_surrogate(
     else:
         for name in names:
             (out / name).unlink(missing_ok=True)
-    try:
-        _run(trainer, checkpoint, console)
-    except KeyboardInterrupt:
-        if not checkpoint.exists():
-            raise KeyboardInterrupt("no checkpoint had been written yet") from None
-        raise KeyboardInterrupt(f"pass --resume to go on from {checkpoint}") from None
+    _run(trainer, checkpoint, console)
     scores = trainer.score()
     console.print(score_table(scores))
     training = {
@@ -290,17 +286,17 @@ def train_surrogate(
     network = trainer.best_network()
     if isinstance(network, RelativeNetwork):
         save_weights(file, Weights(network.export(), trainer.scales, training))
-        console.print(f"weights in {file}", highlight=False)
+        console.print(f"weights in {file}", highlight=False, markup=False)
 
 
 def _run(trainer: Trainer, checkpoint: Path, console: Console) -> None:
-    """All steps that are left, with validation and checkpoint at intervals."""
+    """All steps that are left, with validation and checkpoint at intervals and on Ctrl-C."""
     columns = (
         TextColumn("training"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
         TextColumn("{task.description}"),
     )  # fmt: skip
     n_steps = trainer.settings.steps
-    with Progress(*columns, console=console) as progress:
+    with deferred_interrupt() as interrupt, Progress(*columns, console=console) as progress:
         task = progress.add_task("", total=n_steps, completed=trainer.step_count)
         while trainer.step_count < n_steps:
             trainer.step()
@@ -309,3 +305,6 @@ def _run(trainer: Trainer, checkpoint: Path, console: Console) -> None:
                 loss = trainer.validate()
                 trainer.save(checkpoint)
                 progress.update(task, description=f"validation {loss:.4g}")
+            if interrupt.requested:
+                trainer.save(checkpoint)
+                raise KeyboardInterrupt(f"--resume goes on at step {trainer.step_count}")

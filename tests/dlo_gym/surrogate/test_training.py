@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -280,3 +281,25 @@ class TestTraining:
         assert (r.n_rollouts, r.n_actions, r.n_steps, r.length_min, r.length_max) == (
             2500, 5, 10, 0.45, 0.6,
         )  # fmt: skip
+
+
+def test_ctrl_c_saves_a_checkpoint_that_resume_goes_on_from(data, tmp_path, monkeypatch):
+    step = Trainer.step
+
+    def interrupted(self):
+        step(self)
+        if self.step_count == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Trainer, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt, match="resume goes on at step 3"):
+        train_surrogate(data, SHORT, out=tmp_path / "halves", threads=1)
+    monkeypatch.setattr(Trainer, "step", step)
+    train_surrogate(data, SHORT, out=tmp_path / "halves", threads=1, resume=True)
+    train_surrogate(data, SHORT, out=tmp_path / "whole", threads=1)
+    whole, halves = (
+        load_weights(tmp_path / name / "shape_predictor.safetensors").layers.prediction
+        for name in ("whole", "halves")
+    )
+    for one, other in zip(whole, halves, strict=True):
+        np.testing.assert_array_equal(one[0], other[0])
