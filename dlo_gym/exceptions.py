@@ -51,10 +51,6 @@ class SafetyStop(DloError):
     """A command was refused as a whole and the arms must hold still."""
 
 
-class DeviceError(DloError):
-    """A robot, gripper or camera did not answer as it must."""
-
-
 class MissingExtra(DloError, ImportError):
     """An optional dependency is not installed; says which pip command adds it."""
 

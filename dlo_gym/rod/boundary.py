@@ -100,16 +100,6 @@ class BoundaryDisplacement:
     def scaled(self, factor: float) -> "BoundaryDisplacement":
         return BoundaryDisplacement.from_vector(factor * self.vector)
 
-    def without_axial_rotation(self, boundary: BoundaryPoses) -> "BoundaryDisplacement":
-        """The same without rotation about the rod's own axis (d3) at each clamp of ``boundary``."""
-        parts = []
-        for twist, clamp in ((self.left, boundary.left), (self.right, boundary.right)):
-            if twist is not None and clamp is not None:
-                twist = twist.copy()
-                twist[3:] -= clamp[:3, 2] * (clamp[:3, 2] @ twist[3:])
-            parts.append(twist)
-        return BoundaryDisplacement(*parts)
-
 
 def _displace(clamp: Array, twist: Array | None) -> Array:
     assert twist is not None

@@ -33,14 +33,6 @@ def test_ten_thousand_moves_keep_the_clamps_rigid():
     assert np.abs(error).max() < 2e-15  # without the correction 1e-14 and growing
 
 
-def test_without_axial_rotation_leaves_nothing_about_d3():
-    vector = np.random.default_rng(3).uniform(-0.5, 0.5, 12)
-    cut = BoundaryDisplacement.from_vector(vector).without_axial_rotation(BOUNDARY)
-    assert abs(cut.left[3:] @ BOUNDARY.left[:3, 2]) < 1e-12
-    assert abs(cut.right[3:] @ BOUNDARY.right[:3, 2]) < 1e-12
-    np.testing.assert_array_equal(cut.left[:3], vector[:3])
-
-
 def test_bad_displacements_and_poses_are_named():
     with pytest.raises(ValueError, match="displacement left.*6 finite"):
         BoundaryDisplacement(np.full(6, np.nan), np.zeros(6))

@@ -6,7 +6,7 @@ from scipy.integrate import solve_bvp
 
 from dlo_gym.geometry.se3 import frame_along, pose
 from dlo_gym.rod import BoundaryDisplacement, BoundaryPoses, CosseratRod, RodProperties
-from dlo_gym.rod.initial_shapes import catenary
+from dlo_gym.rod.initial_shapes import arc, catenary
 
 LENGTH = 0.5
 HORIZONTAL = pose(frame_along([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]), [0.1, 0.2, 0.3])
@@ -118,7 +118,9 @@ def test_twisting_the_far_end_takes_the_torsion_torque():
 def test_free_rod_takes_its_rest_curvature():
     curvature = 6.0
     properties = RodProperties(LENGTH, rest_curvature=(curvature, 0.0, 0.0))
-    rod = CosseratRod(properties, 60, gravity=(0.0, 0.0, 0.0), clamp="element")
+    rod = CosseratRod(properties, 60, gravity=(0.0, 0.0, 0.0), clamp="node")
     state = rod.settle(BoundaryPoses(HORIZONTAL))
     np.testing.assert_allclose(state.curvature, [[curvature, 0.0, 0.0]] * 59, atol=1e-6)
+    expected = arc(HORIZONTAL, LENGTH, curvature * LENGTH, 61)
+    np.testing.assert_allclose(state.positions, expected, atol=4e-4 * LENGTH)
     assert state.energy < 1e-9

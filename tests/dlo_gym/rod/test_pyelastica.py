@@ -24,5 +24,6 @@ def test_settles_where_pyelastica_settles(seed):
     end = rod.move(displacement)
     peer = PyElasticaRod(properties, start, displacement, duration=0.5)
     peer.advance(3.0)
+    assert peer.speed < 1e-3  # settled
     assert np.linalg.norm(end.positions - start.positions, axis=1).max() > 0.02
     assert np.linalg.norm(peer.positions - end.positions, axis=1).max() < 0.5e-3
