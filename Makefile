@@ -1,4 +1,5 @@
 # make demo: set up and run the main job.   make test: set up and pass the tests.
+# make demo-robot: the same task through two emulated UR5e.
 
 VENV   ?= .venv
 BIN    := $(VENV)/bin
@@ -13,10 +14,13 @@ export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 export MUJOCO_GL ?= egl
 
-.PHONY: demo test test-all bench lint clean egl
+.PHONY: demo demo-robot test test-all bench soak lint clean egl
 
 demo: $(VENV)/.base egl
 	$(BIN)/dlo demo --out $(OUT) --overwrite
+
+demo-robot: $(VENV)/.robot egl
+	$(BIN)/dlo robot demo --out $(OUT)-robot --overwrite
 
 test: lint egl
 	$(BIN)/pytest
@@ -26,6 +30,9 @@ test-all: lint egl
 
 bench: $(VENV)/.all egl
 	$(BIN)/python -m benchmarks
+
+soak: $(VENV)/.all egl
+	$(BIN)/python -m benchmarks.soak_robot --minutes 30
 
 lint: $(VENV)/.all
 	$(BIN)/ruff check .
@@ -50,9 +57,13 @@ $(VENV)/.base: $(VENV)/.venv pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet -c constraints.txt -e .
 	@touch $@
 
+$(VENV)/.robot: $(VENV)/.venv pyproject.toml constraints.txt
+	$(BIN)/pip install --quiet -c constraints.txt -e '.[robot]'
+	@touch $@ $(VENV)/.base
+
 $(VENV)/.all: $(VENV)/.venv pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet -c constraints.txt -e '.[all]'
-	@touch $@ $(VENV)/.base
+	@touch $@ $(VENV)/.base $(VENV)/.robot
 
 EGL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri
 

@@ -5,7 +5,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from math import sqrt
+from math import inf, sqrt
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal
@@ -29,10 +29,13 @@ from dlo_gym.exceptions import SafetyStop, SolverFailed
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.output_folder import check_output_folder
 from dlo_gym.rod.state import ShapeEstimate
+from dlo_gym.scene.arms import DualArm
 
 OBSERVERS = {"state": "privileged", "tracked": "tracking.observer:TrackerObserver"}
 # How much earlier than the environment the gate says overstretched, in lengths of the rod.
 STRETCH_RESERVE = 0.005
+# How much earlier it says that arms collide [m].
+CLEARANCE_RESERVE = 0.001
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +77,10 @@ class Step:
 
 def gate_for(config: ShapeEnvConfig) -> SafetyGate:
     """A safety gate whose step limits just hold the environment's action box, and whose other
-    limits are the environment's own."""
+    limits are the environment's own.
+
+    It knows the arms exactly if the environment does (``check_arms``).
+    """
     return SafetyGate(
         SafetyLimits(
             max_translation_step=sqrt(3.0) * config.max_translation_step,
@@ -85,7 +91,10 @@ def gate_for(config: ShapeEnvConfig) -> SafetyGate:
             overstretch_margin=1.0 - config.max_stretch + STRETCH_RESERVE,
             min_gripper_distance=config.min_gripper_distance,
             workspace=config.workspace,
-        )
+            max_joint_speed=inf,
+            min_arm_clearance=CLEARANCE_RESERVE,
+        ),
+        DualArm() if config.check_arms else None,
     )
 
 
@@ -122,7 +131,7 @@ def run_episode(
         try:
             command = controller.control(cell_env.estimate, boundary, goal)
             control_ms = 1e3 * (perf_counter() - started)
-            decision = gate.check(command, boundary)
+            decision = gate.check(command, boundary, cell_env.cell.joint_angles)
         except (SolverFailed, SafetyStop) as error:
             name = "solver_failed" if isinstance(error, SolverFailed) else "safety_stop"
             still = info | {"displacement": np.zeros(12), "termination": name}

@@ -13,3 +13,9 @@ register(
     max_episode_steps=100,
     kwargs={"observer": "tracking.observer:TrackerObserver"},
 )
+register(
+    id="dlo_gym/RobotShapeControl-v0",
+    entry_point="sim2real.robot_env:RobotShapeEnv",
+    max_episode_steps=100,
+    nondeterministic=True,  # real time, from where the arms are
+)

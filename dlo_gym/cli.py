@@ -18,6 +18,19 @@ COMMANDS = {
     "rollouts": ("dlo_gym.surrogate.rollouts:rollouts", "simulate rod rollouts for training"),
     "train-surrogate": ("dlo_gym.surrogate.train:train_surrogate", "train the shape predictor"),
     "train-rl": ("control.rl:train_rl", "train a policy with SAC and HER"),
+    "robot init": ("sim2real.templates:init", "write a cell file to start from"),
+    "robot check": ("sim2real.check:check", "connect to a cell, check every part, move nothing"),
+    "robot run": ("sim2real.run:run", "steer the cable of a cell to a goal shape"),
+    "robot record": ("sim2real.record:record", "record a cell without controlling it"),
+    "robot replay": ("sim2real.replay:replay", "run tracker and controller again on a recording"),
+    "robot emulate": ("sim2real.emulator.emulate:emulate", "emulate two UR5e controllers"),
+    "robot demo": ("sim2real.demo:demo", "a shape task through two emulated UR5e"),
+    "robot board": ("sim2real.calibration.board:board", "draw a calibration board for printing"),
+    "robot calibrate": ("sim2real.calibration.calibrate:calibrate", "calibrate cameras and bases"),
+    "robot verify-calibration": (
+        "sim2real.calibration.verify:verify_calibration",
+        "measure whether a cell's calibration still holds",
+    ),
 }
 
 
@@ -26,15 +39,17 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     console = Console(stderr=True)
     if not arguments or arguments[0] in ("-h", "--help"):
-        table = Table("command", "what it does", title="dlo COMMAND [--help]", box=None)
-        for name, (_, summary) in COMMANDS.items():
-            table.add_row(name, summary)
-        Console().print(table)
+        _list("")
         return 0
     name, *rest = arguments
     if name == "--version":
         print(version("dlo-gym"))
         return 0
+    if any(known.startswith(f"{name} ") for known in COMMANDS):  # a group of commands
+        if not rest or rest[0] in ("-h", "--help"):
+            _list(f"{name} ")
+            return 0
+        name, rest = f"{name} {rest[0]}", rest[1:]
     if name not in COMMANDS:
         console.print(f"dlo: no command {name!r}; there are: {', '.join(COMMANDS)}", style="red")
         return 2
@@ -50,3 +65,11 @@ def main(arguments: list[str] | None = None) -> int:
         console.print(f"dlo {name}: interrupted{said}", style="yellow", markup=False)
         return 130
     return 0
+
+
+def _list(group: str) -> None:
+    table = Table("command", "what it does", title=f"dlo {group}COMMAND [--help]", box=None)
+    for name, (_, summary) in COMMANDS.items():
+        if name.startswith(group):
+            table.add_row(name, summary)
+    Console().print(table)

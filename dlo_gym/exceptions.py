@@ -47,8 +47,31 @@ class SolverFailed(DloError):
     """The optimisation behind a controller gave no usable answer."""
 
 
+class DeviceError(DloError):
+    """An arm, gripper or camera cannot be reached, went silent, or refused what it was asked."""
+
+
 class SafetyStop(DloError):
-    """A command was refused as a whole and the arms must hold still."""
+    """A limit was violated and the arms must hold still.
+
+    Attributes:
+        limit: name of the limit; empty where none has a number.
+        value: what was measured or asked for, in the unit of ``bound``.
+        bound: of the limit.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        limit: str = "",
+        value: float = float("nan"),
+        bound: float = float("nan"),
+    ) -> None:
+        super().__init__(message)
+        self.limit = limit
+        self.value = value
+        self.bound = bound
 
 
 class MissingExtra(DloError, ImportError):

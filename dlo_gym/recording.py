@@ -9,7 +9,7 @@ views/<camera>/   000000.jpg or .png, one per sample
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -30,6 +30,7 @@ from dlo_gym.recording_files import (
     positive_or_none,
     read_cameras,
     read_description,
+    read_extra,
     read_signals,
     read_truth,
     required,
@@ -54,6 +55,8 @@ class Recording:
         camera_stamps: per camera name (T,) [s], for cameras that have their own.
         centerline: (T, n_nodes, 3) true shape [m], equally spaced by arc length; None if unknown.
         visible: per camera name (T, n_nodes) whether each node is truly visible.
+        extra: further signals by name, (T, ...), such as the commands of a controlled run.
+        run: settings of the run that was recorded; empty if it was not a controlled one.
     """
 
     name: str
@@ -70,6 +73,8 @@ class Recording:
     camera_stamps: dict[str, Array] = field(default_factory=dict)
     centerline: Array | None = None
     visible: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    extra: dict[str, NDArray[Any]] = field(default_factory=dict)
+    run: dict[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -110,6 +115,8 @@ class Recording:
             visible={
                 c.name: truth[f"visible_{c.name}"] for c in cameras if f"visible_{c.name}" in truth
             },
+            extra=read_extra(root / "signals.npz", signals),
+            run=description.get("run", {}),
         )
 
     def camera(self, name: str) -> CameraModel:
@@ -158,6 +165,7 @@ class RecordingWriter:
         name: of the recording; the folder's name if omitted.
         youngs_modulus, density: [Pa], [kg/m^3]; left out if None.
         image_format: "png" (lossless) or "jpg" (quality 95).
+        run: settings of the run, as JSON takes them.
 
     Raises:
         FileExistsError: if ``path`` exists.
@@ -175,6 +183,7 @@ class RecordingWriter:
         youngs_modulus: float | None = None,
         density: float | None = None,
         image_format: str = "png",
+        run: Mapping[str, Any] | None = None,
     ) -> None:
         self.path = Path(path)
         if self.path.exists():
@@ -208,6 +217,8 @@ class RecordingWriter:
                 for camera in self.cameras
             ],
         }
+        if run:
+            self._description["run"] = dict(run)
         for key, value in {**rod, "rate_hz": rate_hz}.items():
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"{key}: expected a positive number, got {value}")
@@ -227,6 +238,7 @@ class RecordingWriter:
         *,
         centerline: ArrayLike | None = None,
         visible: ArrayLike | None = None,
+        extra: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         """Adds one sample; every sample must bring the same kinds of data as the first.
 
@@ -236,6 +248,7 @@ class RecordingWriter:
             stamp: [s].
             centerline: (n_nodes, 3) true shape [m].
             visible: (n_views, n_nodes) true visibility, in the order of the writer's cameras.
+            extra: further signals by name.
 
         Raises:
             ValueError: naming the argument that does not fit; the sample is then not added.
@@ -249,7 +262,7 @@ class RecordingWriter:
                 f"views: expected one of each camera {sorted(expected)},"
                 f" got {[view.camera.name for view in views]}"
             )
-        sample = self._checked_sample(clamp_left, clamp_right, stamp, centerline, visible)
+        sample = self._checked_sample(clamp_left, clamp_right, stamp, centerline, visible, extra)
         index = len(self._samples)
         for camera in self.cameras:
             view = by_name[camera.name]
@@ -273,8 +286,13 @@ class RecordingWriter:
         stamp: float,
         centerline: ArrayLike | None,
         visible: ArrayLike | None,
+        extra: Mapping[str, ArrayLike] | None,
     ) -> dict[str, Any]:
         sample: dict[str, Any] = {"clamp_left": check_single_pose(clamp_left, "clamp_left")}
+        for key, value in (extra or {}).items():
+            if key.startswith(("stamps", "clamp_", "centerline", "visible_")):
+                raise ValueError(f"extra: {key!r} is a name of the format itself")
+            sample[key] = np.array(value)
         if not np.isfinite(stamp):
             raise ValueError(f"stamp: expected a finite time [s], got {stamp}")
         sample["stamps"] = float(stamp)

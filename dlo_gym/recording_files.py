@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +137,16 @@ def read_signals(file: Path, cameras: tuple[CameraModel, ...]) -> dict[str, Arra
         if key in arrays:
             signals[key] = _array(arrays, key, (n_samples,), file)
     return signals
+
+
+def read_extra(file: Path, known: Mapping[str, Array]) -> dict[str, NDArray[Any]]:
+    """What signals.npz holds of T samples beside the arrays in ``known``."""
+    n_samples = len(known["stamps"])
+    return {
+        key: array
+        for key, array in _read_npz(file).items()
+        if key not in known and array.ndim and len(array) == n_samples
+    }
 
 
 def read_truth(

@@ -1,1 +1,1 @@
-"""Real UR5e cells; empty until the simulated loop leaves the simulator."""
+"""Real cells of two UR5e arms and fixed cameras, and their emulation."""

@@ -8,7 +8,7 @@ from dlo_gym import cli
 def test_every_command_explains_itself(capsys):
     for name in cli.COMMANDS:
         with pytest.raises(SystemExit) as end:
-            cli.main([name, "--help"])
+            cli.main([*name.split(), "--help"])
         assert end.value.code == 0
         text = capsys.readouterr().out
         assert f"dlo {name}" in text

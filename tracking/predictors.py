@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from dlo_gym.exceptions import RodDiverged
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.properties import RodProperties
@@ -9,6 +10,8 @@ from dlo_gym.rod.rod import CosseratRod
 from tracking.tracker import Predictor
 
 PREDICTORS = ("network", "rod")
+# Clamps moved less far than this are followed [m], [rad]; farther, the rod settles from scratch.
+NEAR = (0.05, 0.3)
 
 
 class RodPredictor:
@@ -53,15 +56,26 @@ class RodPredictor:
         boundary = boundary or self._boundary
         if boundary is None:
             raise ValueError("boundary: expected the clamp poses at the first prediction, got None")
-        if self._boundary is None or not _same(self._boundary, boundary):
-            self._rod.settle(boundary)
-            self._boundary = boundary
-        before = self._rod.state.positions
+        before = self._at(boundary)
         # Diverged or refused, the rod stays where it was: the next prediction settles anew.
         self._boundary = None
         after = self._rod.move(displacement).positions
         self._boundary = boundary.displaced(displacement)
         return after + self.memory * (centerline - before)
+
+    def _at(self, boundary: BoundaryPoses) -> Array:
+        """The equilibrium (n, 3) [m] with the clamps at ``boundary``."""
+        if self._boundary is not None and _same(self._boundary, boundary):
+            return self._rod.state.positions
+        if self._boundary is not None:
+            displacement = self._boundary.displacement_to(boundary)
+            steps = np.linalg.norm(displacement.vector.reshape(-1, 2, 3), axis=2)
+            if (steps < NEAR).all():
+                try:
+                    return self._rod.move(displacement).positions
+                except RodDiverged:
+                    pass
+        return self._rod.settle(boundary).positions
 
 
 def _same(a: BoundaryPoses, b: BoundaryPoses) -> bool:

@@ -166,7 +166,7 @@ class ShapeControlEnv(gym.Env):
         if start is not None and (not isinstance(start, BoundaryPoses) or start.right is None):
             raise ValueError(f"start: expected BoundaryPoses of two clamps, got {start!r}")
         if goal is not None:
-            goal = _check_goal(goal, config)
+            goal = check_goal(goal, config)
         occluders = sample_occluder_paths(rng, self.cell.cameras, config.n_occluders)
         if start is not None:
             self.cell.reset(start, occluders)
@@ -266,14 +266,7 @@ class ShapeControlEnv(gym.Env):
         return spaces.Dict(entries)
 
     def _observation(self) -> dict[str, NDArray]:
-        centerline = self.estimate.centerline.ravel()
-        boundary = self.cell.boundary
-        clamps = [clamp_numbers(clamp) for clamp in (boundary.left, boundary.right)]
-        observation: dict[str, NDArray] = {
-            "observation": np.concatenate([centerline, *clamps]).astype(np.float32),
-            "achieved_goal": centerline.astype(np.float32),
-            "desired_goal": self.goal.ravel().astype(np.float32),
-        }
+        observation = shape_observation(self.estimate.centerline, self.cell.boundary, self.goal)
         if self.config.observation_mode == "images":
             for view in self.cell.views():
                 observation[f"image_{view.camera.name}"] = view.image.copy()
@@ -297,7 +290,24 @@ class ShapeControlEnv(gym.Env):
         }
 
 
-def _check_goal(goal: ArrayLike, config: ShapeEnvConfig) -> Array:
+def shape_observation(
+    centerline: Array, boundary: BoundaryPoses, goal: Array
+) -> dict[str, NDArray]:
+    """The observation of a centerline (n, 3) [m] held at ``boundary``, for a goal (n, 3) [m]."""
+    clamps = [clamp_numbers(clamp) for clamp in (boundary.left, boundary.right)]
+    return {
+        "observation": np.concatenate([centerline.ravel(), *clamps]).astype(np.float32),
+        "achieved_goal": centerline.ravel().astype(np.float32),
+        "desired_goal": goal.ravel().astype(np.float32),
+    }
+
+
+def check_goal(goal: ArrayLike, config: ShapeEnvConfig) -> Array:
+    """``goal`` as a centerline (n_nodes, 3) that the rod of ``config`` can take.
+
+    Raises:
+        ValueError: on a wrong shape, a value that is not finite, or an overstretched goal.
+    """
     goal = np.array(goal, dtype=np.float64)
     if goal.shape != (config.n_nodes, 3) or not np.isfinite(goal).all():
         raise ValueError(

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from dlo_gym.exceptions import UnreachablePose
 from dlo_gym.geometry.se3 import Array, check_pose, exp_so3, inverse, pose
@@ -33,14 +33,16 @@ T_CLAMP_TCP = np.stack(
 def link_frames(joint_angles: ArrayLike) -> Array:
     """DH frames 0 to 6 in the arm's base frame (..., 7, 4, 4) of joint angles (..., 6) [rad]."""
     q = np.asarray(joint_angles, dtype=np.float64)
+    transforms = _dh_transform(np.arange(6), q)
     frames = np.empty((*q.shape[:-1], 7, 4, 4))
     frames[..., 0, :, :] = np.eye(4)
     for i in range(6):
-        frames[..., i + 1, :, :] = frames[..., i, :, :] @ _dh_transform(i, q[..., i])
+        np.matmul(frames[..., i, :, :], transforms[..., i, :, :], out=frames[..., i + 1, :, :])
     return frames
 
 
-def _dh_transform(i: int, angle: Array) -> Array:
+def _dh_transform(i: int | NDArray[np.int_], angle: Array) -> Array:
+    """Transforms (..., 4, 4) of joints ``i`` (0 to 5) at angles (...) [rad]."""
     c, s = np.cos(angle), np.sin(angle)
     ca, sa = np.cos(DH_ALPHA[i]), np.sin(DH_ALPHA[i])
     transform = np.zeros((*np.shape(angle), 4, 4))
@@ -199,19 +201,23 @@ class DualArm:
     Attributes:
         T_world_base: (2, 4, 4) the arms' base frames, left then right.
         home: (2, 6) joint angles [rad] that the first inverse kinematics start from.
+        T_flange_tcp: (2, 4, 4) the grippers' tool centre points.
 
     Raises:
-        ValueError: on a base that is not rigid or a home outside the joint limits.
+        ValueError: on a base or tool centre point that is not rigid or a home outside the joint
+            limits.
     """
 
     T_world_base: Array = field(default_factory=_default_bases)
     home: Array = field(default_factory=_default_home)
+    T_flange_tcp: Array = field(default_factory=lambda: np.stack([T_FLANGE_TCP, T_FLANGE_TCP]))
 
     def __post_init__(self) -> None:
-        bases = check_pose(self.T_world_base, "T_world_base")
-        if bases.shape != (2, 4, 4):
-            raise ValueError(f"T_world_base: expected shape (2, 4, 4), got {bases.shape}")
-        object.__setattr__(self, "T_world_base", bases)
+        for name in ("T_world_base", "T_flange_tcp"):
+            poses = check_pose(getattr(self, name), name)
+            if poses.shape != (2, 4, 4):
+                raise ValueError(f"{name}: expected shape (2, 4, 4), got {poses.shape}")
+            object.__setattr__(self, name, poses)
         object.__setattr__(self, "home", _check_joint_angles(self.home, "home"))
 
     def inverse_kinematics(self, boundary: BoundaryPoses, guess: ArrayLike | None = None) -> Array:
@@ -241,7 +247,7 @@ class DualArm:
     def forward_kinematics(self, joint_angles: ArrayLike) -> BoundaryPoses:
         """The clamp poses where joint angles (2, 6) [rad] hold the rod's ends."""
         frames = link_frames(_check_joint_angles(joint_angles, "joint_angles"))
-        T_world_tcp = self.T_world_base @ frames[:, 6] @ T_FLANGE_TCP
+        T_world_tcp = self.T_world_base @ frames[:, 6] @ self.T_flange_tcp
         left, right = T_world_tcp @ inverse(T_CLAMP_TCP)
         return BoundaryPoses(left, right)
 
@@ -261,7 +267,7 @@ class DualArm:
         )
 
     def _flange_in_base(self, side: int, clamp: Array) -> Array:
-        T_world_flange = clamp @ T_CLAMP_TCP[side] @ inverse(T_FLANGE_TCP)
+        T_world_flange = clamp @ T_CLAMP_TCP[side] @ inverse(self.T_flange_tcp[side])
         return inverse(self.T_world_base[side]) @ T_world_flange
 
 

@@ -14,6 +14,7 @@ from dlo_gym.geometry.camera import CameraModel
 from dlo_gym.geometry.se3 import matrix_to_quaternion
 from dlo_gym.scene import arm_model, cell_model
 from dlo_gym.scene.arms import SIDES, DualArm
+from dlo_gym.scene.board import BoardPlate, add_board
 from dlo_gym.scene.lens import Lens
 
 MULTISAMPLES = 4  # of quality "high"
@@ -43,6 +44,7 @@ class SceneConfig:
         quality: "fast", or "high" with shadows and antialiasing.
         seed: of the distractor cables' curves.
         arms: where the arms stand.
+        boards: printed plates that the grippers carry, at most one each.
 
     Raises:
         ValueError: naming the field.
@@ -59,9 +61,14 @@ class SceneConfig:
     quality: Literal["fast", "high"] = "fast"
     seed: int = 0
     arms: DualArm = field(default_factory=DualArm)
+    boards: tuple[BoardPlate, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cameras", tuple(self.cameras))
+        object.__setattr__(self, "boards", tuple(self.boards))
+        carriers = [plate.side for plate in self.boards]
+        if len(set(carriers)) != len(carriers):
+            raise ValueError(f"boards: expected at most one per arm, got {', '.join(carriers)}")
         names = [camera.name for camera in self.cameras]
         if not names or len(set(names)) != len(names):
             raise ValueError(f"cameras: expected at least one, with distinct names, got {names}")
@@ -128,6 +135,8 @@ def build_spec(config: SceneConfig) -> mujoco.MjSpec:
     cell_model.add_distractor_cables(spec, config.n_distractor_cables, rng)
     for side, T_world_base in zip(SIDES, config.arms.T_world_base, strict=True):
         arm_model.add_arm(spec, side, T_world_base, config.rod_radius)
+    for plate in config.boards:
+        add_board(spec, plate, config.arms.T_flange_tcp[SIDES.index(plate.side)])
     _add_rod(spec, config)
     _add_occluders(spec, config)
     for pinhole in pinholes:

@@ -6,8 +6,9 @@
 import os
 import weakref
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
+import cv2
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +22,7 @@ from dlo_gym.scene.lens import Lens
 
 _SEGMENT_FLAGS = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
 _RED = 255
+_SCENERY = 1  # geom group of what never moves
 
 
 class SceneRenderer:
@@ -42,6 +44,9 @@ class SceneRenderer:
         self._lenses = {lens.camera.name: lens for lens in self.config.lenses}
         self._rod = _geoms(self.model, "rod", self.config.n_nodes - 1)
         self._occluders = _geoms(self.model, "occluder", self.config.n_occluders)
+        moving = np.concatenate([self._rod, self._occluders])
+        fixed = np.setdiff1d(np.flatnonzero(self.model.geom_bodyid == 0), moving)
+        self.model.geom_group[fixed] = _SCENERY
         self._positions: Array | None = None
         self._canvas: _Canvas | None = None
 
@@ -209,12 +214,25 @@ def _facing_points(positions: Array, centre: Array, radius: float) -> Array:
     return positions + radius * across / np.maximum(norms, 1e-12)
 
 
+class _Layer(NamedTuple):
+    """Colours (height, width, 3) and OpenGL depths (height, width) in [0, 1], rows upwards.
+
+    Without depths where shadows are drawn.
+    """
+
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32] | None
+
+
 class _Canvas:
     """An offscreen framebuffer of one model, with its OpenGL context."""
 
     def __init__(self, model: mujoco.MjModel, *, shadows: bool) -> None:
         self._model = model
         self._option = mujoco.MjvOption()
+        self._shown = self._option.geomgroup.copy()
+        self._shadows = shadows
+        self._scenery: dict[str, _Layer] = {}
         self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 64)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
@@ -224,9 +242,28 @@ class _Canvas:
         self.close.atexit = False  # MuJoCo's own exit handler may have ended EGL by then
 
     def color(self, data: mujoco.MjData, name: str, pinhole: CameraModel) -> NDArray[np.uint8]:
-        """RGB (height, width, 3) of the model's camera ``name``."""
+        """RGB (height, width, 3) of the model's camera ``name``.
+
+        Cameras and scenery stand still, so the scenery is drawn once per camera, and what moves is
+        laid over it by depth; pixel for pixel the same. Shadows fall on scenery: then all is drawn.
+        """
+        if self._shadows:
+            self._look(data, name)
+            return cv2.flip(self._draw(pinhole).rgb, 0)  # type: ignore[return-value]
+        if name not in self._scenery:
+            self._option.geomgroup[:] = np.arange(len(self._option.geomgroup)) == _SCENERY
+            self._look(data, name)
+            self._scenery[name] = self._draw(pinhole)
+        scenery = self._scenery[name]
+        self._option.geomgroup[:] = self._shown
+        self._option.geomgroup[_SCENERY] = 0
         self._look(data, name)
-        return self._draw(pinhole)
+        self._option.geomgroup[:] = self._shown
+        moving = self._draw(pinhole)
+        rgb = scenery.rgb.copy()
+        nearer = cv2.compare(moving.depth, scenery.depth, cv2.CMP_LT)  # type: ignore[arg-type]
+        cv2.copyTo(moving.rgb, nearer, rgb)
+        return cv2.flip(rgb, 0)  # type: ignore[return-value]
 
     def mask(
         self, data: mujoco.MjData, name: str, pinhole: CameraModel, geom_ids: NDArray[np.intp]
@@ -239,7 +276,7 @@ class _Canvas:
             geom.segid = _RED - 1 if geom.objid in wanted else 0
         self._scene.flags[_SEGMENT_FLAGS] = True
         try:
-            return (self._draw(pinhole)[..., 0] == _RED).view(np.uint8)
+            return np.ascontiguousarray(self._draw(pinhole).rgb[::-1, :, 0] == _RED).view(np.uint8)
         finally:
             self._scene.flags[_SEGMENT_FLAGS] = False
 
@@ -251,13 +288,17 @@ class _Canvas:
             self._model, data, self._option, None, camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
         )
 
-    def _draw(self, pinhole: CameraModel) -> NDArray[np.uint8]:
+    def _draw(self, pinhole: CameraModel) -> "_Layer":
+        """What the scene holds; OpenGL's rows go upwards."""
         self._gl.make_current()
         rectangle = mujoco.MjrRect(0, 0, pinhole.width, pinhole.height)
         mujoco.mjr_render(rectangle, self._scene, self._context)
-        pixels = np.empty((pinhole.height, pinhole.width, 3), dtype=np.uint8)
-        mujoco.mjr_readPixels(pixels, None, rectangle, self._context)
-        return np.ascontiguousarray(pixels[::-1])
+        rgb = np.empty((pinhole.height, pinhole.width, 3), dtype=np.uint8)
+        depth = None
+        if not self._shadows:
+            depth = np.empty((pinhole.height, pinhole.width), dtype=np.float32)
+        mujoco.mjr_readPixels(rgb, depth, rectangle, self._context)
+        return _Layer(rgb, depth)
 
 
 def _open_context(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:

@@ -30,8 +30,8 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from dlo_gym.atomic_file import written_aside
 from dlo_gym.exceptions import DatasetError
-from dlo_gym.surrogate.atomic_file import written_aside
 from dlo_gym.surrogate.simulation import Rollouts, RolloutSettings, simulate_rollout
 
 SCHEMA = "dlo-rollouts/1"

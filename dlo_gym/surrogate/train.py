@@ -13,11 +13,11 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from dlo_gym.atomic_file import written_aside
 from dlo_gym.exceptions import DatasetError, MissingExtra, WeightsError
 from dlo_gym.geometry.se3 import Array, exp_so3, matrix_to_quaternion
 from dlo_gym.interrupts import deferred_interrupt
 from dlo_gym.rod.boundary import BoundaryDisplacement
-from dlo_gym.surrogate.atomic_file import written_aside
 from dlo_gym.surrogate.evaluation import Score, evaluate_predictor, score_table
 from dlo_gym.surrogate.predictor import ShapePredictor
 from dlo_gym.surrogate.rollouts import load_rollouts

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from dlo_gym.atomic_file import written_aside
 from dlo_gym.exceptions import WeightsError
-from dlo_gym.surrogate.atomic_file import written_aside
 
 SCHEMA = "dlo-shape-predictor/1"
 SHIPPED = Path(__file__).parent / "weights" / "shape_predictor.safetensors"

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from control.safety import SafetyDecision, SafetyGate, SafetyLimits
+from control.safety import SafetyDecision, SafetyGate, SafetyLimits, Violation
 from dlo_gym.exceptions import SafetyStop
 from dlo_gym.geometry.se3 import exp_so3, pose
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
@@ -71,6 +71,9 @@ def assert_within_limits(
     assert (origins <= np.maximum(upper, former) + 1e-12).all()
     assert after.distance <= max(limits.max_gripper_distance, before.distance) * ROUNDING
     assert after.distance >= min(limits.min_gripper_distance, before.distance) - 1e-9
+    for point, normal in limits.planes:
+        unit = np.asarray(normal) / np.linalg.norm(normal)
+        assert ((origins - point) @ unit >= np.minimum((former - point) @ unit, 0) - 1e-9).all()
 
 
 @settings(max_examples=300, deadline=None)
@@ -130,6 +133,88 @@ def test_a_command_cut_by_the_step_keeps_its_direction(command):
     asked = command.vector / largest
     fraction = decision.displacement.vector @ asked / (asked @ asked)
     assert_allclose(decision.displacement.vector, fraction * asked, atol=1e-15, rtol=1e-9)
+
+
+PLANES = (((0.0, 0.1, 0.0), (0.0, -1.0, 0.0)), ((0.0, 0.0, 0.3), (0.3, 0.0, 2.0)))
+
+
+@settings(max_examples=150, deadline=None)
+@given(inside, inside, commands)
+def test_no_command_crosses_a_plane(left, right, command):
+    limits = replace(LIMITS, planes=PLANES)
+    boundary = boundary_at(left, right)
+    assert_within_limits(boundary, SafetyGate(limits).check(command, boundary), limits)
+
+
+def test_at_a_plane_the_command_slides_along_it():
+    limits = replace(LIMITS, planes=(((0.0, 0.0, 0.3), (0.0, 0.0, 2.0)),))
+    on_it = boundary_at((-0.2, 0.0, 0.3), (0.2, 0.0, 0.34))
+    decision = SafetyGate(limits).check(moved(left=(0.004, 0, -0.004)), on_it)
+    assert decision.reasons == ("plane",)
+    assert_allclose(decision.displacement.left[:3], [0.004, 0, 0], atol=1e-9)
+    assert decision.cuts[0].value == pytest.approx(-0.004)
+    assert decision.cuts[0].bound == pytest.approx(0.0)
+
+
+ACCELERATION = replace(LIMITS, max_acceleration=0.3, max_rotation_acceleration=2.0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(commands, min_size=3, max_size=10))
+def test_velocities_change_by_no_more_than_the_acceleration_unless_they_shrink(sequence):
+    gate, boundary = SafetyGate(ACCELERATION), START
+    before = np.zeros((2, 2, 3))
+    bounds = np.array([0.3, 2.0]) * ACCELERATION.control_period**2
+    for command in sequence:
+        decision = gate.check(command, boundary)
+        assert_within_limits(boundary, decision, ACCELERATION)
+        step = decision.displacement.vector.reshape(2, 2, 3)
+        # The nearest of many points between the former velocity and standing still.
+        between = before * np.linspace(0.0, 1.0, 2001)[:, None, None, None]
+        change = np.linalg.norm(step - between, axis=3).min(axis=0)
+        assert (change <= bounds * (1 + 1e-5) + np.linalg.norm(before, axis=2) / 4000).all()
+        boundary, before = decision.target, step
+
+
+def test_a_start_is_slow_a_stop_is_at_once_and_a_turn_waits():
+    gate = SafetyGate(ACCELERATION)
+    forwards = moved(left=(0.01, 0, 0), right=(0.01, 0, 0))
+    steps, boundary = [], START
+    for command in (forwards, forwards, forwards, forwards.scaled(-1.0), forwards.scaled(0.0)):
+        decision = gate.check(command, boundary)
+        steps.append(decision.displacement.left[0])
+        boundary = decision.target
+        if command is forwards and len(steps) < 3:
+            assert decision.reasons == ("acceleration",)
+    assert_allclose(steps, [0.003, 0.006, 0.009, -0.003, 0.0], atol=1e-8)
+    gate.reset()
+    assert gate.check(forwards, boundary).displacement.left[0] == pytest.approx(0.003)
+
+
+def test_cuts_name_limit_value_and_bound():
+    near = boundary_at((-0.2, 0.0, 0.202), (0.2, 0.0, 0.34))
+    decision = SafetyGate(LIMITS).check(moved(left=(0.004, 0, -0.006)), near)
+    (cut,) = decision.cuts
+    assert (cut.limit, cut.what, cut.unit) == ("workspace", "left clamp's z", "m")
+    assert cut.value == pytest.approx(0.196)
+    assert cut.bound == pytest.approx(0.2)
+    assert str(cut) == "workspace: left clamp's z 0.196 m, at least 0.2 m"
+    assert str(cut) in str(decision)
+    assert str(decision).startswith("left [1.3, 0.0, -2.0] mm")
+
+
+def test_values_close_to_the_bound_are_told_from_it():
+    assert "0.400004 m, at most 0.4 m" in str(Violation("w", "z", 0.4000040001, 0.4, "m"))
+
+
+def test_the_stop_says_limit_value_and_bound():
+    gate = SafetyGate(LIMITS)
+    gate.check(BoundaryDisplacement.zero(), START)
+    with pytest.raises(SafetyStop) as caught:
+        gate.check(BoundaryDisplacement.zero(), START.displaced(moved(left=(0, 0, 0.1))))
+    assert caught.value.limit == "deviation"
+    assert caught.value.value == pytest.approx(0.1)
+    assert caught.value.bound == LIMITS.max_deviation
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -232,6 +317,14 @@ def test_a_rod_with_a_free_end():
         ("overstretch_margin", 1.0),
         ("min_gripper_distance", 0.6),
         ("workspace", ((0.0, 0.0, 0.0), (1.0, 1.0, 0.0))),
+        ("planes", (((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),)),
+        ("planes", ((0.0, 0.0, 1.0),)),
+        ("max_acceleration", 0.0),
+        ("max_joint_speed", np.nan),
+        ("max_force", -1.0),
+        ("max_pose_age", np.inf),
+        ("min_arm_clearance", -0.01),
+        ("measured_tolerance", np.inf),
     ],
 )
 def test_senseless_limits_are_refused(field, value):

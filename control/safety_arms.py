@@ -1,0 +1,256 @@
+"""Steps of the grippers that the arms can follow without touching each other or the table."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from control.safety_limits import SafetyLimits, Violation
+from control.safety_steps import BLOCKED, AllowedSteps
+from dlo_gym.exceptions import SafetyStop, UnreachablePose
+from dlo_gym.geometry.se3 import Array, exp_so3, inverse
+from dlo_gym.rod.boundary import BoundaryPoses
+from dlo_gym.scene.arms import (
+    CAPSULES,
+    SIDES,
+    T_CLAMP_TCP,
+    DualArm,
+    ik_branches,
+    link_frames,
+    nearest_turn,
+    segment_distances,
+)
+
+# A step is looked at in this many points of its way, then in as many more before the first of
+# them that breaks a limit.
+POINTS = 5
+ROUNDING = 1e-9
+DIFFERENCE = 1e-5  # of finite differences [m]
+LEVER = 0.15  # [m]; a rotation counts as the motion of a point this far from the clamp
+# A step that slides along an arm's surface also leaves it a little, by this part of its length,
+# because the surface is curved.
+LIFT = 0.05
+
+CLEARANCES = (
+    "between the arms",
+    *(f"{side} arm to the table" for side in SIDES),
+    *(f"{side} arm to itself" for side in SIDES),
+)
+
+_FRAMES = np.array([capsule[0] for capsule in CAPSULES])
+_ENDS = np.array([capsule[1:3] for capsule in CAPSULES])
+_RADII = np.array([capsule[3] for capsule in CAPSULES])
+_MOVING = _FRAMES >= 2
+_PAIRS = np.array(
+    [
+        (a, b)
+        for a, frame_a in enumerate(_FRAMES)
+        for b, frame_b in enumerate(_FRAMES)
+        if frame_a - frame_b >= 3 or (frame_a, frame_b) in ((3, 1), (4, 2))
+    ]
+)
+
+
+class Followed(NamedTuple):
+    """A step (k, 2, 3) that the arms follow, the joint angles (2, 6) [rad] they come to and
+    start from, and what cut it."""
+
+    step: Array
+    joint_angles: Array
+    start: Array
+    violations: list[Violation]
+
+
+class _Tried(NamedTuple):
+    """Fractions (m,) of a step: joint angles (m, 2, 6) [rad], what the limits look at (m, n_rows),
+    whether they hold (m,)."""
+
+    fractions: Array
+    joint_angles: Array
+    values: Array
+    passed: NDArray[np.bool_]
+
+
+class ArmSteps:
+    """A step (k, 2, 3) of clamps at poses (k, 4, 4), as far as the arms can follow it.
+
+    Keeps reach, joint speed and acceleration, and the clearances of the arms. These limits are
+    not convex, so the step is looked at in ``POINTS`` points of its way. A limit that is already
+    broken at the poses is widened to what it is there: standing still always passes.
+
+    Args:
+        limits: to keep.
+        arms: whose grippers hold the clamps.
+        clamps: (k, 4, 4) poses in the world.
+        joint_angles: (2, 6) near which the arms are [rad].
+        former: (2, 6) the joints' step before [rad], which accelerations count from.
+    """
+
+    def __init__(
+        self, limits: SafetyLimits, arms: DualArm, clamps: Array, joint_angles: Array, former: Array
+    ) -> None:
+        self.limits, self.arms, self.clamps = limits, arms, clamps
+        self.guess, self.former = joint_angles, former
+        k = len(clamps)
+        self.T_base_world = inverse(arms.T_world_base)[:k]
+        self.T_clamp_flange = T_CLAMP_TCP[:k] @ inverse(arms.T_flange_tcp)[:k]
+        self._stands = False
+
+    def cut(self, step: Array, allowed: AllowedSteps) -> Followed:
+        """The part of ``step`` (k, 2, 3), which ``allowed`` holds, that the arms follow too.
+
+        Raises:
+            SafetyStop: if an arm cannot hold its clamp where it is.
+        """
+        fraction, straight = self._straight(step)
+        near = any(violation.limit == "clearance" for violation in straight.violations)
+        if fraction < BLOCKED and near:
+            slid = self._slid(step)
+            slid = allowed.largest_fraction(slid) * slid
+            along, sliding = self._straight(slid)
+            if along > BLOCKED:
+                return sliding._replace(violations=straight.violations)
+        return straight
+
+    def _straight(self, step: Array) -> tuple[float, Followed]:
+        """The largest fraction of ``step`` (k, 2, 3) up to which the arms follow, and where to."""
+        whole = self._tried(step, np.linspace(0.0, 1.0, POINTS + 1))
+        if whole.passed.all():
+            return 1.0, Followed(step, whole.joint_angles[-1], self.start, [])
+        # Shown for the whole step; where only its way is barred, for the bar.
+        first = int(np.argmin(whole.passed))
+        shown = first if whole.passed[-1] else -1
+        violations = self._violations(whole.joint_angles[shown], whole.values[shown])
+        before, bar = whole.fractions[first - 1 : first + 1].tolist()
+        fine = self._tried(step, np.linspace(before, bar, POINTS + 1))
+        fine.passed[0], fine.passed[-1] = True, False  # as seen, whatever rounding says now
+        last = int(np.argmin(fine.passed)) - 1
+        fraction = float(fine.fractions[last])
+        return fraction, Followed(fraction * step, fine.joint_angles[last], self.start, violations)
+
+    def _tried(self, step: Array, fractions: Array) -> _Tried:
+        """Fractions (m,) of ``step`` (k, 2, 3); the first time from zero, so that where the arms
+        are needs no call of its own."""
+        joint_angles = self.reached(fractions[:, None, None, None] * step)
+        near = clearances(self.arms, joint_angles)
+        if not self._stands:
+            self._stand(joint_angles[0], near[0])
+        values = np.concatenate([self._rates(joint_angles), near], axis=1)
+        passed = np.all(self.signs * (values - self.bounds) <= ROUNDING, axis=1)
+        return _Tried(fractions, joint_angles, values, np.asarray(passed))
+
+    def _stand(self, joint_angles: Array, near: Array) -> None:
+        """Takes joint angles (2, 6) and clearances (5,) for where the arms are: steps count from
+        there, limits are widened to it."""
+        if not np.isfinite(joint_angles).all():
+            raise _unreachable(self.arms, self.clamps, self.guess)
+        self.start, self.clearance, self._stands = joint_angles, near, True
+        joints = (
+            ("joint speed", "rad/s", self.limits.max_joint_speed),
+            ("joint acceleration", "rad/s^2", self.limits.max_joint_acceleration),
+        )
+        self.rows = [
+            (name, f"{side} arm", unit, bound, False)
+            for name, unit, bound in joints
+            for side in SIDES
+        ]
+        least = np.minimum(self.limits.min_arm_clearance, self.clearance).tolist()
+        self.rows += [
+            ("clearance", what, "m", bound, True)
+            for what, bound in zip(CLEARANCES, least, strict=True)
+        ]
+        self.bounds = np.array([row[3] for row in self.rows])
+        self.signs = np.array([-1.0 if row[4] else 1.0 for row in self.rows])
+
+    def reached(self, steps: Array) -> Array:
+        """(m, 2, 6) joint angles after steps (m, k, 2, 3), as ``DualArm.inverse_kinematics``
+        gives them; NaN where an arm does not reach."""
+        k = len(self.clamps)
+        clamps = np.tile(self.clamps, (len(steps), 1, 1, 1))
+        clamps[..., :3, :3] = exp_so3(steps[:, :, 1]) @ clamps[..., :3, :3]
+        clamps[..., :3, 3] += steps[:, :, 0]
+        flanges = self.T_base_world @ clamps @ self.T_clamp_flange
+        branches = ik_branches(flanges, self.guess[:k, 5])
+        branches = nearest_turn(branches, self.guess[:k, None])
+        away = np.square(branches - self.guess[:k, None]).sum(axis=-1)
+        nearest = np.argmin(np.where(np.isnan(away), np.inf, away), axis=-1)
+        joint_angles = np.tile(self.guess, (len(steps), 1, 1))
+        chosen = np.take_along_axis(branches, nearest[..., None, None], axis=2)
+        joint_angles[:, :k] = chosen[:, :, 0]
+        return joint_angles
+
+    def _rates(self, joint_angles: Array) -> Array:
+        """(m, 4) largest joint speeds of the arms [rad/s], then accelerations [rad/s^2], on the
+        way to joint angles (m, 2, 6); NaN out of reach."""
+        period = self.limits.control_period
+        step = joint_angles - self.start
+        # Slowing down does not count: only what goes beyond the former step or turns round.
+        lower, upper = np.minimum(self.former, 0.0), np.maximum(self.former, 0.0)
+        change = np.abs(step - np.clip(step, lower, upper))
+        rates = [np.abs(step).max(axis=2) / period, change.max(axis=2) / period**2]
+        return np.concatenate(rates, axis=1)
+
+    def _violations(self, joint_angles: Array, values: Array) -> list[Violation]:
+        """The limits that joint angles (2, 6) with ``values`` (n_rows,) break."""
+        found = [
+            Violation("reach", f"{side} arm cannot take its clamp there")
+            for side, angles in zip(SIDES, joint_angles, strict=True)
+            if np.isnan(angles).any()
+        ]
+        for (limit, what, unit, bound, at_least), value, excess in zip(
+            self.rows, values.tolist(), (self.signs * (values - self.bounds)).tolist(), strict=True
+        ):
+            if excess > ROUNDING:
+                found.append(Violation(limit, what, value, bound, unit, at_least))
+        return found
+
+    def _slid(self, step: Array) -> Array:
+        """``step`` (k, 2, 3) turned along the surfaces that it would press the arms against."""
+        k = len(self.clamps)
+        scale = np.tile(np.repeat([1.0, 1.0 / LEVER], 3), k)
+        tried = np.eye(6 * k) * DIFFERENCE * scale
+        near = clearances(self.arms, self.reached(tried.reshape(-1, k, 2, 3)))
+        # (5, 6 k); NaN at the edge of an arm's reach, where nothing can be said.
+        gradients = np.nan_to_num(((near - self.clearance) / DIFFERENCE).T)
+        room = self.bounds[-len(CLEARANCES) :] - self.clearance
+        scaled = step.ravel() / scale
+        lift = LIFT * float(np.linalg.norm(scaled))
+        # Rounds of projections onto each surface's half-space, from which the others may push.
+        for _ in range(3):
+            for gradient, least in zip(gradients, room, strict=True):
+                size = float(gradient @ gradient)
+                missing = least - float(gradient @ scaled)
+                if missing > 0.0 and size > 1e-9:
+                    scaled = scaled + (missing + lift * np.sqrt(size)) / size * gradient
+        return (scaled * scale).reshape(k, 2, 3)
+
+
+def clearances(arms: DualArm, joint_angles: Array) -> Array:
+    """``DualArm.clearance`` of joint angles (m, 2, 6) and of each arm, (m, 5), by
+    ``CLEARANCES`` [m]."""
+    m = len(joint_angles)
+    T = (arms.T_world_base[:, None] @ link_frames(joint_angles))[:, :, _FRAMES]
+    ends = (T[..., None, :3, :3] @ _ENDS[..., None])[..., 0] + T[..., None, :3, 3]
+    a, b = _PAIRS.T
+    # One call for all pairs: the time goes into calls, not into numbers.
+    across = np.broadcast_arrays(ends[:, 0, :, None], ends[:, 1, None])
+    first, second = (
+        np.concatenate([x.reshape(m, -1, 2, 3), ends[:, :, y].reshape(m, -1, 2, 3)], axis=1)
+        for x, y in zip(across, (a, b), strict=True)
+    )
+    gaps = segment_distances(first, second)
+    between = gaps[:, : len(_RADII) ** 2] - (_RADII[:, None] + _RADII).ravel()
+    within = gaps[:, len(_RADII) ** 2 :].reshape(m, 2, -1) - _RADII[a] - _RADII[b]
+    table = (ends[..., 2].min(axis=-1) - _RADII)[:, :, _MOVING]
+    return np.concatenate(
+        [between.min(axis=1)[:, None], table.min(axis=2), within.min(axis=2)], axis=1
+    )
+
+
+def _unreachable(arms: DualArm, clamps: Array, guess: Array) -> SafetyStop:
+    """The stop where the arms cannot even be where they are."""
+    try:
+        arms.inverse_kinematics(BoundaryPoses(*clamps), guess)
+    except UnreachablePose as error:
+        return SafetyStop(f"reach: {error}", limit="reach")
+    return SafetyStop("reach: the arms cannot hold the clamps where they are", limit="reach")

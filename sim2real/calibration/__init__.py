@@ -1,0 +1,1 @@
+"""Camera calibration: intrinsics, and extrinsics to both robot bases."""

@@ -1,0 +1,1 @@
+"""UR e-Series controllers and the world around them, emulated on loopback addresses."""
