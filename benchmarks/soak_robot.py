@@ -32,15 +32,13 @@ class Soak:
     Attributes:
         steps: commands sent and accepted.
         late: of each step [s].
-        begun: how often a loop took over, once per goal and once more after each stop.
-        goals: how many goals there were.
+        restarts: how often the loop had to start anew.
         memory: per process, resident bytes over time.
     """
 
     steps: int = 0
     late: list[float] = field(default_factory=list)
-    begun: int = 0
-    goals: int = 0
+    restarts: int = 0
     memory: dict[str, list[int]] = field(default_factory=dict)
 
     def growth(self, process: str) -> float:
@@ -55,20 +53,19 @@ def soak(config: CellConfig, minutes: float) -> Iterator[Soak]:
     end = time.monotonic() + 60.0 * minutes
     with EmulatedCell.of(config) as emulation, RobotCell(config) as robot:
         robot.open()
+        robot.engage()
         processes = {name: psutil.Process(pid) for name, pid in emulation.pids.items()}
         processes["loop"] = psutil.Process()
-        others = {process.pid for process in processes.values()}
-        for child in psutil.Process().children():
-            if child.pid not in others and "ur5e" in " ".join(child.cmdline()):
-                processes[f"client {child.pid}"] = child
+        for side, arm in robot.arms.items():
+            processes[f"{side} client"] = psutil.Process(arm.client_pid)  # type: ignore[attr-defined]
         goal_seed = 0
         while time.monotonic() < end:
             goal = make_goal("sampled", config, robot.commanded, goal_seed)
-            goal_seed = result.goals = goal_seed + 1
+            goal_seed += 1
             for step in control_steps(robot, ClosedLoop(config, goal), steps=EPISODE):
                 result.steps += 1
                 result.late.append(step.late)
-                result.begun += step.begins
+                result.restarts += step.begins
                 if result.steps % 10 == 0:
                     for name, process in processes.items():
                         result.memory.setdefault(name, []).append(process.memory_info().rss)
@@ -92,7 +89,7 @@ def main(minutes: float = 30.0) -> None:
     table.add_row("commands sent and accepted", str(result.steps))
     late = 100.0 * np.mean(np.array(result.late) > config.control.period_s)
     table.add_row("late by more than a period", f"{late:.2f} %")
-    table.add_row("started anew", str(result.begun - result.goals))
+    table.add_row("started anew", str(result.restarts))
     for name in result.memory:
         megabytes = result.memory[name][-1] / 2**20
         table.add_row(

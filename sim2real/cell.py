@@ -21,7 +21,8 @@ from sim2real.pose_history import interpolate_poses
 from sim2real.ur5e.handle import UR5eArm
 from sim2real.ur5e.settings import UR5eSettings
 
-POLL = 0.02  # between two looks at the arms while waiting [s]
+WATCH = 0.04  # between two looks at the arms while waiting [s]
+POLL = 0.01  # between two looks for new images [s]
 HISTORY = 0.05  # before an image from which arm poses are looked up [s]
 
 
@@ -174,15 +175,16 @@ class RobotCell:
             DeviceError: if none comes in time.
             SafetyStop: from ``watch``.
         """
-        deadline = time.monotonic() + timeout
+        start = looked = time.monotonic()
         while (sample := self.sample()) is None:
-            if time.monotonic() > deadline:
+            if time.monotonic() > start + timeout:
                 raise DeviceError(
                     f"no images of {', '.join(self.cameras)} that were taken together came within"
                     f" {timeout:g} s; are the cameras' clocks and latencies right?"
                 )
-            if watching:
+            if watching and time.monotonic() > looked + WATCH:
                 self.watch()
+                looked = time.monotonic()
             time.sleep(POLL)
         return sample
 
@@ -259,7 +261,7 @@ class RobotCell:
             left = deadline - time.monotonic()
             if left <= 0.0:
                 return
-            time.sleep(min(left, POLL))
+            time.sleep(min(left, WATCH))
 
     def send(self, target: BoundaryPoses, duration: float) -> BoundaryPoses:
         """Streams both arms to ``target`` within ``duration`` [s]; returns what they accepted.

@@ -16,6 +16,7 @@ from sim2real.loop import ClosedLoop, LoopInput, LoopOutput
 # The share of a period by which a target lies beyond the next command: without it the arms would
 # slow down at each target.
 BLEND = 1.5
+PASSING = ("pose age", "image age", "program")
 RECOVERY_PAUSE = 0.5  # between two attempts [s]
 
 
@@ -89,12 +90,12 @@ def control_steps(
             late = max(0.0, step.sent + origin - (tick + period))
             yield replace(step, late=late, begins=begins)
             begins, made = False, made + 1
-            # After a late step the next one starts at once, not several to catch up.
-            tick = max(tick + period, time.monotonic() - period)
+            # After a late step the next one starts at once, and the periods count from there.
+            tick = max(tick + period, time.monotonic())
             cell.wait_until(tick)
-        except (SafetyStop, DeviceError):
+        except (SafetyStop, DeviceError) as stop:
             cell.halt()
-            if recoveries <= 0:
+            if recoveries <= 0 or not _is_passing(stop):
                 raise
             recoveries -= 1
             _recover(cell, 10.0)
@@ -135,6 +136,11 @@ def _warm_up(cell: RobotCell, loop: ClosedLoop, sample: CellSample) -> None:
     """One step of a loop that is thrown away: compiles and loads before the clock runs."""
     given = _input(cell, sample, cell.commanded, sample.stamp)
     ClosedLoop(loop.config, loop.goal).step(given)
+
+
+def _is_passing(stop: SafetyStop | DeviceError) -> bool:
+    """Whether what stopped the arms may be over without a person: a link, not a force."""
+    return isinstance(stop, DeviceError) or stop.limit in PASSING
 
 
 def _recover(cell: RobotCell, timeout: float) -> None:

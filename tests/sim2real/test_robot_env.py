@@ -181,8 +181,8 @@ def test_dark_images_end_the_episode_as_track_lost(env, monkeypatch):
     env.reset(seed=3)
     wait_for_sample = env.cell.wait_for_sample
 
-    def dark():
-        sample = wait_for_sample()
+    def dark(**how):
+        sample = wait_for_sample(**how)
         views = tuple(View(0 * view.image, view.camera, view.stamp) for view in sample.views)
         return sample._replace(views=views)
 
