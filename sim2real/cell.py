@@ -206,15 +206,10 @@ class RobotCell:
         poses = []
         for side in SIDES:
             history = self.arms[side].readings(stamp - HISTORY)
-            poses.append(
-                interpolate_poses(
-                    [reading.stamp for reading in history],
-                    self._tcp(side, history),
-                    stamp,
-                )
-                if len(history) > 1
-                else _unknown(side, stamp)
-            )
+            if len(history) < 2:
+                raise ValueError(f"{side} arm: no readings around {stamp:.3f} s are known")
+            stamps = [reading.stamp for reading in history]
+            poses.append(interpolate_poses(stamps, self._tcp(side, history), stamp))
         return self._clamps(np.stack(poses))
 
     def watch(self) -> None:
@@ -358,7 +353,3 @@ def make_cameras(config: CellConfig) -> dict[str, Camera]:
         )
         for name, camera in config.cameras.items()
     }
-
-
-def _unknown(side: str, stamp: float) -> Array:
-    raise ValueError(f"{side} arm: no readings around {stamp:.3f} s are known")
