@@ -22,6 +22,7 @@ from sim2real.loop import ClosedLoop
 from sim2real.steps import control_steps
 
 EPISODE = 60  # control steps to one goal
+SETTLED = 1.0  # after the last command of an episode [s]
 WARM = 0.3  # share of the run after which memory counts
 
 
@@ -32,12 +33,14 @@ class Soak:
     Attributes:
         steps: commands sent and accepted.
         late: of each step [s].
+        arrived: after each episode, how far a clamp is from where it was last sent [m].
         restarts: how often the loop had to start anew.
         memory: per process, resident bytes over time.
     """
 
     steps: int = 0
     late: list[float] = field(default_factory=list)
+    arrived: list[float] = field(default_factory=list)
     restarts: int = 0
     memory: dict[str, list[int]] = field(default_factory=dict)
 
@@ -70,6 +73,9 @@ def soak(config: CellConfig, minutes: float) -> Iterator[Soak]:
                     for name, process in processes.items():
                         result.memory.setdefault(name, []).append(process.memory_info().rss)
                 yield result
+            robot.wait_until(time.monotonic() + SETTLED)
+            away = robot.boundary.displacement_to(robot.commanded).vector.reshape(2, 2, 3)
+            result.arrived.append(float(np.linalg.norm(away[:, 0], axis=1).max()))
 
 
 def main(minutes: float = 30.0) -> None:
@@ -89,6 +95,7 @@ def main(minutes: float = 30.0) -> None:
     table.add_row("commands sent and accepted", str(result.steps))
     late = 100.0 * np.mean(np.array(result.late) > config.control.period_s)
     table.add_row("late by more than a period", f"{late:.2f} %")
+    table.add_row("clamps from their last command", f"{1e3 * max(result.arrived):.3f} mm at most")
     table.add_row("started anew", str(result.restarts))
     for name in result.memory:
         megabytes = result.memory[name][-1] / 2**20
