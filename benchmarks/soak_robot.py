@@ -3,8 +3,11 @@
 ``make soak`` runs 30 minutes; a test runs a minute of it.
 """
 
+import itertools
+import os
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +17,8 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from dlo_gym.exceptions import DeviceError, SafetyStop
+from dlo_gym.scene.arms import SIDES
 from sim2real.cell import RobotCell
 from sim2real.config import TEMPLATES, CellConfig
 from sim2real.emulator.emulated_cell import EmulatedCell
@@ -23,6 +28,7 @@ from sim2real.steps import control_steps
 
 EPISODE = 60  # control steps to one goal
 SETTLED = 1.0  # after the last command of an episode [s]
+RECOVERIES = 10  # of one episode, by the loop itself
 WARM = 0.3  # share of the run after which memory counts
 
 
@@ -34,7 +40,7 @@ class Soak:
         steps: commands sent and accepted.
         late: of each step [s].
         arrived: after each episode, how far a clamp is from where it was last sent [m].
-        restarts: how often the loop had to start anew.
+        restarts: how often the loop began anew after a link had broken, by itself.
         memory: per process, resident bytes over time.
     """
 
@@ -43,6 +49,11 @@ class Soak:
     arrived: list[float] = field(default_factory=list)
     restarts: int = 0
     memory: dict[str, list[int]] = field(default_factory=dict)
+
+    def note_memory(self, processes: dict[str, int]) -> None:
+        """Appends the resident memory of processes (ids by name)."""
+        for name, pid in processes.items():
+            self.memory.setdefault(name, []).append(psutil.Process(pid).memory_info().rss)
 
     def growth(self, process: str) -> float:
         """Largest memory after the warm-up relative to that at its end [-]."""
@@ -57,25 +68,43 @@ def soak(config: CellConfig, minutes: float) -> Iterator[Soak]:
     with EmulatedCell.of(config) as emulation, RobotCell(config) as robot:
         robot.open()
         robot.engage()
-        processes = {name: psutil.Process(pid) for name, pid in emulation.pids.items()}
-        processes["loop"] = psutil.Process()
-        for side, arm in robot.arms.items():
-            processes[f"{side} client"] = psutil.Process(arm.client_pid)  # type: ignore[attr-defined]
-        goal_seed = 0
-        while time.monotonic() < end:
-            goal = make_goal("sampled", config, robot.commanded, goal_seed)
-            goal_seed += 1
-            for step in control_steps(robot, ClosedLoop(config, goal), steps=EPISODE):
+        for goal_seed in itertools.count():
+            if time.monotonic() >= end:
+                return
+            _make_ready(robot, result)
+            loop = ClosedLoop(config, make_goal("sampled", config, robot.commanded, goal_seed))
+            for step in control_steps(robot, loop, steps=EPISODE, recoveries=RECOVERIES):
                 result.steps += 1
                 result.late.append(step.late)
                 result.restarts += step.begins
                 if result.steps % 10 == 0:
-                    for name, process in processes.items():
-                        result.memory.setdefault(name, []).append(process.memory_info().rss)
+                    result.note_memory(_processes(emulation, robot))
                 yield result
-            robot.wait_until(time.monotonic() + SETTLED)
-            away = robot.boundary.displacement_to(robot.commanded).vector.reshape(2, 2, 3)
-            result.arrived.append(float(np.linalg.norm(away[:, 0], axis=1).max()))
+            _see_arrive(robot, result)
+
+
+def _processes(emulation: EmulatedCell, robot: RobotCell) -> dict[str, int]:
+    """Ids of all processes of the emulated cell and of its user, by name."""
+    clients = {f"{side} client": robot.arms[side].client_pid for side in SIDES}  # type: ignore[attr-defined]
+    return emulation.pids | {"loop": os.getpid()} | clients
+
+
+def _make_ready(robot: RobotCell, result: Soak) -> None:
+    """Gets over a link that broke between two episodes, as the loop does within one."""
+    try:
+        robot.readings()
+    except DeviceError:
+        robot.recover()
+        result.restarts += 1
+
+
+def _see_arrive(robot: RobotCell, result: Soak) -> None:
+    """Waits until the arms are where they were sent, and notes how far off they are."""
+    commanded = robot.commanded
+    with suppress(DeviceError, SafetyStop):  # a link broke, which the next episode sees to
+        robot.wait_until(time.monotonic() + SETTLED)
+        away = robot.boundary.displacement_to(commanded).vector.reshape(2, 2, 3)
+        result.arrived.append(float(np.linalg.norm(away[:, 0], axis=1).max()))
 
 
 def main(minutes: float = 30.0) -> None:
@@ -96,7 +125,7 @@ def main(minutes: float = 30.0) -> None:
     late = 100.0 * np.mean(np.array(result.late) > config.control.period_s)
     table.add_row("late by more than a period", f"{late:.2f} %")
     table.add_row("clamps from their last command", f"{1e3 * max(result.arrived):.3f} mm at most")
-    table.add_row("started anew", str(result.restarts))
+    table.add_row("recoveries, by itself", str(result.restarts))
     for name in result.memory:
         megabytes = result.memory[name][-1] / 2**20
         table.add_row(

@@ -9,7 +9,8 @@ import numpy as np
 
 from control.safety_limits import SafetyLimits, Violation
 from dlo_gym.geometry.se3 import Array
-from dlo_gym.scene.arms import JOINT_LIMIT, SIDES, DualArm
+from dlo_gym.scene.arms import SIDES, DualArm
+from dlo_gym.scene.ur5e import JOINT_LIMIT
 
 # Safety modes of a UR controller in which its arm may move.
 MOVING_MODES = ("normal", "reduced")
@@ -187,10 +188,10 @@ class SafetyMonitor:
         least = 0.5 * limits.min_arm_clearance
         for what, clearance in (
             ("between the arms", near.between_arms),
-            ("arms to the table", near.to_table),
-            ("arms to themselves", near.within_arm),
+            ("arms to the table", near.to_table.min()),
+            ("arms to themselves", near.within_arm.min()),
         ):
-            found += _held("clearance", what, clearance, least, "m", at_least=True)
+            found += _held("clearance", what, float(clearance), least, "m", at_least=True)
         return found
 
     def _at_one_time(self, arms: DualArm, readings: Sequence[ArmReading]) -> tuple[Array, Array]:

@@ -8,18 +8,11 @@ from numpy.typing import NDArray
 from control.safety_limits import SafetyLimits, Violation
 from control.safety_steps import BLOCKED, AllowedSteps
 from dlo_gym.exceptions import SafetyStop, UnreachablePose
-from dlo_gym.geometry.se3 import Array, exp_so3, inverse
+from dlo_gym.geometry.se3 import Array, exp_so3
 from dlo_gym.rod.boundary import BoundaryPoses
-from dlo_gym.scene.arms import (
-    CAPSULES,
-    SIDES,
-    T_CLAMP_TCP,
-    DualArm,
-    ik_branches,
-    link_frames,
-    nearest_turn,
-    segment_distances,
-)
+from dlo_gym.scene.arms import SIDES, DualArm
+from dlo_gym.scene.clearance import clearance
+from dlo_gym.scene.ur5e import nearest_solution
 
 # A step is looked at in this many points of its way, then in as many more before the first of
 # them that breaks a limit.
@@ -35,19 +28,6 @@ CLEARANCES = (
     "between the arms",
     *(f"{side} arm to the table" for side in SIDES),
     *(f"{side} arm to itself" for side in SIDES),
-)
-
-_FRAMES = np.array([capsule[0] for capsule in CAPSULES])
-_ENDS = np.array([capsule[1:3] for capsule in CAPSULES])
-_RADII = np.array([capsule[3] for capsule in CAPSULES])
-_MOVING = _FRAMES >= 2
-_PAIRS = np.array(
-    [
-        (a, b)
-        for a, frame_a in enumerate(_FRAMES)
-        for b, frame_b in enumerate(_FRAMES)
-        if frame_a - frame_b >= 3 or (frame_a, frame_b) in ((3, 1), (4, 2))
-    ]
 )
 
 
@@ -91,9 +71,6 @@ class ArmSteps:
     ) -> None:
         self.limits, self.arms, self.clamps = limits, arms, clamps
         self.guess, self.former = joint_angles, former
-        k = len(clamps)
-        self.T_base_world = inverse(arms.T_world_base)[:k]
-        self.T_clamp_flange = T_CLAMP_TCP[:k] @ inverse(arms.T_flange_tcp)[:k]
         self._stands = False
 
     def cut(self, step: Array, allowed: AllowedSteps) -> Followed:
@@ -169,14 +146,9 @@ class ArmSteps:
         clamps = np.tile(self.clamps, (len(steps), 1, 1, 1))
         clamps[..., :3, :3] = exp_so3(steps[:, :, 1]) @ clamps[..., :3, :3]
         clamps[..., :3, 3] += steps[:, :, 0]
-        flanges = self.T_base_world @ clamps @ self.T_clamp_flange
-        branches = ik_branches(flanges, self.guess[:k, 5])
-        branches = nearest_turn(branches, self.guess[:k, None])
-        away = np.square(branches - self.guess[:k, None]).sum(axis=-1)
-        nearest = np.argmin(np.where(np.isnan(away), np.inf, away), axis=-1)
         joint_angles = np.tile(self.guess, (len(steps), 1, 1))
-        chosen = np.take_along_axis(branches, nearest[..., None, None], axis=2)
-        joint_angles[:, :k] = chosen[:, :, 0]
+        flanges = self.arms.flange_in_base(clamps)
+        joint_angles[:, :k] = nearest_solution(flanges, self.guess[:k])
         return joint_angles
 
     def _rates(self, joint_angles: Array) -> Array:
@@ -226,25 +198,9 @@ class ArmSteps:
 
 
 def clearances(arms: DualArm, joint_angles: Array) -> Array:
-    """``DualArm.clearance`` of joint angles (m, 2, 6) and of each arm, (m, 5), by
-    ``CLEARANCES`` [m]."""
-    m = len(joint_angles)
-    T = (arms.T_world_base[:, None] @ link_frames(joint_angles))[:, :, _FRAMES]
-    ends = (T[..., None, :3, :3] @ _ENDS[..., None])[..., 0] + T[..., None, :3, 3]
-    a, b = _PAIRS.T
-    # One call for all pairs: the time goes into calls, not into numbers.
-    across = np.broadcast_arrays(ends[:, 0, :, None], ends[:, 1, None])
-    first, second = (
-        np.concatenate([x.reshape(m, -1, 2, 3), ends[:, :, y].reshape(m, -1, 2, 3)], axis=1)
-        for x, y in zip(across, (a, b), strict=True)
-    )
-    gaps = segment_distances(first, second)
-    between = gaps[:, : len(_RADII) ** 2] - (_RADII[:, None] + _RADII).ravel()
-    within = gaps[:, len(_RADII) ** 2 :].reshape(m, 2, -1) - _RADII[a] - _RADII[b]
-    table = (ends[..., 2].min(axis=-1) - _RADII)[:, :, _MOVING]
-    return np.concatenate(
-        [between.min(axis=1)[:, None], table.min(axis=2), within.min(axis=2)], axis=1
-    )
+    """``DualArm.clearance`` of joint angles (m, 2, 6) as (m, 5), by ``CLEARANCES`` [m]."""
+    near = clearance(arms.T_world_base, joint_angles)
+    return np.concatenate([near.between_arms[:, None], near.to_table, near.within_arm], axis=1)
 
 
 def _unreachable(arms: DualArm, clamps: Array, guess: Array) -> SafetyStop:

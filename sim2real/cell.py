@@ -13,7 +13,8 @@ from dlo_gym.exceptions import DeviceError
 from dlo_gym.geometry.camera import View
 from dlo_gym.geometry.se3 import Array, inverse
 from dlo_gym.rod.boundary import BoundaryPoses
-from dlo_gym.scene.arms import SIDES, T_CLAMP_TCP, link_frames
+from dlo_gym.scene.arms import SIDES, T_CLAMP_TCP
+from dlo_gym.scene.ur5e import link_frames
 from sim2real.arm import Arm, SimulatedArm
 from sim2real.cameras.camera import Camera, CameraSettings, make_camera, synchronised
 from sim2real.config import CellConfig
@@ -23,6 +24,7 @@ from sim2real.ur5e.settings import UR5eSettings
 
 WATCH = 0.04  # between two looks at the arms while waiting [s]
 POLL = 0.01  # between two looks for new images [s]
+SPACING = 0.8  # of a control period: two commands are at least this far apart
 HISTORY = 0.05  # before an image from which arm poses are looked up [s]
 
 
@@ -65,6 +67,7 @@ class RobotCell:
         self.cameras = dict(cameras) if cameras else make_cameras(config)
         self.under_control = False
         self._commanded: BoundaryPoses | None = None
+        self._sent = -np.inf
         self._last_stamp = -np.inf
         self._image_stamps: dict[str, float] = {}
         self._stack = ExitStack()
@@ -179,14 +182,22 @@ class RobotCell:
         while (sample := self.sample()) is None:
             if time.monotonic() > start + timeout:
                 raise DeviceError(
-                    f"no images of {', '.join(self.cameras)} that were taken together came within"
-                    f" {timeout:g} s; are the cameras' clocks and latencies right?"
+                    f"no images of {', '.join(self.cameras)} that were taken together, with poses"
+                    f" of both arms at that time, came within {timeout:g} s: {self._newest_ages()};"
+                    " are the cameras' clocks and latencies right?"
                 )
             if watching and time.monotonic() > looked + WATCH:
                 self.watch()
                 looked = time.monotonic()
             time.sleep(POLL)
         return sample
+
+    def _newest_ages(self) -> str:
+        """How old the newest image of each camera and the newest pose of each arm are, in words."""
+        now = time.monotonic()
+        newest = {name: camera.latest().stamp for name, camera in self.cameras.items()}
+        newest |= {f"{side} arm": reading.stamp for side, reading in self.readings().items()}
+        return ", ".join(f"{name} {now - stamp:.3f} s old" for name, stamp in newest.items())
 
     def refresh(self) -> CellSample:
         """New images while the arms stand, after a pause that has made the last ones old.
@@ -261,12 +272,19 @@ class RobotCell:
     def send(self, target: BoundaryPoses, duration: float) -> BoundaryPoses:
         """Streams both arms to ``target`` within ``duration`` [s]; returns what they accepted.
 
+        The safety gate counts a whole control period for every step that it allows. So a command
+        that comes early, after one that was late, is held back until its time.
+
         Raises:
             DeviceError: if an arm is gone or refuses; both have been told to stop then.
             SafetyStop: if an arm is in a protective or emergency stop; likewise.
             UnreachablePose: if an arm cannot reach it; likewise.
         """
         assert target.right is not None
+        earliest = self._sent + SPACING * self.config.control.period_s
+        if time.monotonic() < earliest:
+            self.wait_until(earliest)
+        self._sent = time.monotonic()
         accepted = []
         try:
             for index, clamp in enumerate((target.left, target.right)):

@@ -10,7 +10,8 @@ from dlo_gym.exceptions import DeviceError, DloError, MissingExtra
 from dlo_gym.geometry.se3 import Array, inverse
 from dlo_gym.rod.boundary import BoundaryPoses
 from dlo_gym.rod.rod import CosseratRod
-from dlo_gym.scene.arms import JOINT_LIMIT, SIDES
+from dlo_gym.scene.arms import SIDES
+from dlo_gym.scene.ur5e import JOINT_LIMIT
 from sim2real.calibration.cell_file import changed_since_calibration
 from sim2real.cameras.camera import Camera, Frame
 from sim2real.cell import CellSample

@@ -28,6 +28,7 @@ from sim2real.loop import ClosedLoop
 from sim2real.run import steer, summary
 
 MADE = ("report.html", "views.mp4", "views.png", "plots.png", "metrics.json", "recording")
+RECOVERIES = 5  # a busy machine may freeze a stream for a moment
 
 
 def demo(
@@ -87,6 +88,7 @@ def demo(
             robot,
             ClosedLoop(config, goal, speed),
             steps=steps,
+            recoveries=RECOVERIES,
             recording=partial / "recording",
             settings={"goal": goal.tolist(), "speed": speed, "seed": seed},
             live=live,

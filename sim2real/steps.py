@@ -74,11 +74,18 @@ def control_steps(
     Raises:
         SafetyStop, DeviceError, TrackLost, SolverFailed: after both arms were told to stop.
     """
-    first = cell.refresh()
+    begins = False
+    try:
+        first = cell.refresh()
+    except DeviceError:
+        if recoveries <= 0 or not cell.under_control:
+            raise
+        recoveries, begins = recoveries - 1, True
+        first = _recover(cell, 10.0)
     _warm_up(cell, loop, first)
     period, origin = cell.config.control.period_s, first.stamp
     yield _step(cell, loop, first, origin)
-    tick, begins, made = time.monotonic(), False, 0
+    tick, made = time.monotonic(), 0
     while made < steps:
         try:
             if not dry_run and not cell.under_control:
@@ -143,14 +150,13 @@ def _is_passing(stop: SafetyStop | DeviceError) -> bool:
     return isinstance(stop, DeviceError) or stop.limit in PASSING
 
 
-def _recover(cell: RobotCell, timeout: float) -> None:
-    """Tries to make the cell ready again until ``timeout`` [s] has passed."""
+def _recover(cell: RobotCell, timeout: float) -> CellSample:
+    """Tries to make the cell ready again until ``timeout`` [s] has passed; its first images."""
     deadline = time.monotonic() + timeout
     while True:
         try:
             cell.recover()
-            cell.refresh()
-            return
+            return cell.refresh()
         except DeviceError:
             cell.halt()
             if time.monotonic() > deadline:

@@ -7,7 +7,8 @@ import mujoco
 import numpy as np
 
 from dlo_gym.geometry.se3 import Array, exp_so3, matrix_to_quaternion
-from dlo_gym.scene.arms import DH_A, DH_ALPHA, DH_D, JOINT_LIMIT, TCP_DISTANCE
+from dlo_gym.scene.arms import TCP_DISTANCE
+from dlo_gym.scene.ur5e import DH_A, DH_ALPHA, DH_D, JOINT_LIMIT
 
 # name: (rgb, specular, shininess)
 MATERIALS = {

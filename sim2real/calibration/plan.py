@@ -12,15 +12,14 @@ from dlo_gym.atomic_file import written_aside
 from dlo_gym.exceptions import DloError, UnreachablePose
 from dlo_gym.geometry.camera import CameraModel
 from dlo_gym.geometry.se3 import Array, exp_so3, inverse, pose, transform_points
-from dlo_gym.scene.arms import (
-    CAPSULES,
-    SIDES,
-    DualArm,
-    ik_branches,
-    link_frames,
-    nearest_turn,
+from dlo_gym.scene.arms import SIDES, DualArm
+from dlo_gym.scene.clearance import (
+    CAPSULE_FRAMES,
+    CAPSULE_RADII,
+    capsule_axes,
     segment_distances,
 )
+from dlo_gym.scene.ur5e import ik_branches, link_frames, nearest_turn
 from sim2real.calibration.board import BoardSpec
 
 DEFAULT_REGION = ((-0.25, -0.3, 0.22), (0.25, 0.12, 0.5))
@@ -33,9 +32,6 @@ _LARGEST_TURN = 2.4  # of any joint, away from home [rad]
 _PATH_STEP = 0.1  # between two checked points of a joint-space path [rad]
 _TRIES_PER_POSE = 400
 _ROUNDS = 5
-_FRAMES = np.array([capsule[0] for capsule in CAPSULES])
-_ENDS = np.array([capsule[1:3] for capsule in CAPSULES])
-_RADII = np.array([capsule[3] for capsule in CAPSULES])
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,27 +262,26 @@ class _Cell:
         """Ends (2, n, 2, 3) of both arms' capsules in the world, and the board's frame (4, 4)."""
         joints = self.joints.copy()
         joints[self.side] = joint_angles
-        frames = link_frames(joints)
-        T = (self.arms.T_world_base[:, None] @ frames)[:, _FRAMES]
-        ends = np.einsum("snij,nej->snei", T[..., :3, :3], _ENDS) + T[..., None, :3, 3]
-        T_world_flange = self.arms.T_world_base[self.side] @ frames[self.side, 6]
-        return ends, T_world_flange @ self.arms.T_flange_tcp[self.side] @ self.T_tcp_board
+        axes = capsule_axes(self.arms.T_world_base, joints)
+        T_world_flange = self.arms.T_world_base[self.side] @ link_frames(joint_angles)[6]
+        return axes, T_world_flange @ self.arms.T_flange_tcp[self.side] @ self.T_tcp_board
 
     def is_clear(self, joint_angles: Array) -> bool:
         """Whether arms and board keep their distance to each other and the table."""
         joints = self.joints.copy()
         joints[self.side] = joint_angles
         clearance = self.arms.clearance(joints)
-        if clearance.within_arm < 0.0 or clearance.between_arms < _CLEARANCE:
+        if clearance.within_arm.min() < 0.0 or clearance.between_arms < _CLEARANCE:
             return False
         ends, T_world_board = self._capsules(joint_angles)
         lines = transform_points(T_world_board, self._board_lines())
-        lowest = min(clearance.to_table, float(lines[..., 2].min()))
+        lowest = min(float(clearance.to_table.min()), float(lines[..., 2].min()))
         if lowest < _TABLE_CLEARANCE:
             return False
-        other = segment_distances(lines[:, None], ends[1 - self.side]) - _RADII
+        other = segment_distances(lines[:, None], ends[1 - self.side]) - CAPSULE_RADII
         # The gripper itself may touch the board that it holds.
-        own = segment_distances(lines[:, None], ends[self.side][_FRAMES < 5]) - _RADII[_FRAMES < 5]
+        arm = CAPSULE_FRAMES < 5
+        own = segment_distances(lines[:, None], ends[self.side][arm]) - CAPSULE_RADII[arm]
         return bool(min(other.min(), own.min()) > _CLEARANCE)
 
     def _board_lines(self) -> Array:
@@ -301,7 +296,7 @@ class _Cell:
         spots = [(0.5, 0.5), (0.15, 0.15), (0.85, 0.15), (0.15, 0.85), (0.85, 0.85)]
         points = transform_points(T_world_board, [(x * width, y * height, 0.0) for x, y in spots])
         rays = np.stack([np.broadcast_to(camera.centre, points.shape), points], axis=1)
-        gaps = segment_distances(rays[:, None], ends.reshape(-1, 2, 3)) - np.tile(_RADII, 2)
+        gaps = segment_distances(rays[:, None], ends.reshape(-1, 2, 3)) - np.tile(CAPSULE_RADII, 2)
         return bool(gaps.min() > 0.0)
 
     def tour(self, poses: Sequence[PlannedPose], at: Array) -> list[PlannedPose]:

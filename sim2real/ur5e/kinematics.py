@@ -14,7 +14,7 @@ from dlo_gym.geometry.se3 import (
     pose,
     quaternion_to_matrix,
 )
-from dlo_gym.scene.arms import ik_branches, link_frames, nearest_turn
+from dlo_gym.scene.ur5e import ik_branches, link_frames, nearest_turn
 
 
 def pose_numbers(transform: Array) -> tuple[float, ...]:

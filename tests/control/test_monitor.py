@@ -12,7 +12,8 @@ from control.monitor import ArmReading, SafetyMonitor
 from control.safety_limits import SafetyLimits
 from dlo_gym.exceptions import SafetyStop
 from dlo_gym.geometry.se3 import Array
-from dlo_gym.scene.arms import SIDES, DualArm, link_frames
+from dlo_gym.scene.arms import SIDES, DualArm
+from dlo_gym.scene.ur5e import link_frames
 
 ARMS = DualArm()
 LIMITS = SafetyLimits(max_acceleration=1.0, max_rotation_acceleration=20.0)

@@ -10,7 +10,8 @@ from control.monitor import ArmReading
 from dlo_gym import cli
 from dlo_gym.exceptions import DeviceError, DloError, UnreachablePose
 from dlo_gym.geometry.se3 import inverse, log_so3, transform_points
-from dlo_gym.scene.arms import SIDES, link_frames
+from dlo_gym.scene.arms import SIDES
+from dlo_gym.scene.ur5e import link_frames
 from sim2real.calibration.collect import Stillness, collect, collect_by_hand
 from sim2real.calibration.hand_eye import check_rotations
 from sim2real.calibration.plan import (

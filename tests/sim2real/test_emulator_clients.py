@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from dlo_gym.geometry.se3 import exp_so3, log_so3, pose
-from dlo_gym.scene.arms import T_FLANGE_TCP, link_frames
+from dlo_gym.scene.arms import T_FLANGE_TCP
+from dlo_gym.scene.ur5e import link_frames
 from sim2real.emulator.process import EmulatedController
 from tests.sim2real.raw_rtde import address_of
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dlo_gym.geometry.se3 import exp_so3, log_so3, pose
-from dlo_gym.scene.arms import ik_branches, link_frames, nearest_turn
+from dlo_gym.scene.ur5e import ik_branches, link_frames, nearest_turn
 from sim2real.emulator import kinematics
 
 TCP = [0.02, -0.01, 0.163, 0.2, -0.1, 0.4]

@@ -14,9 +14,10 @@ from dlo_gym.exceptions import DeviceError
 from dlo_gym.geometry.se3 import exp_so3, pose
 from dlo_gym.rod.boundary import BoundaryPoses
 from dlo_gym.rod.properties import RodProperties
-from dlo_gym.scene.arms import T_CLAMP_TCP, DualArm, link_frames
+from dlo_gym.scene.arms import T_CLAMP_TCP, DualArm
 from dlo_gym.scene.builder import default_cameras
 from dlo_gym.scene.renderer import SceneRenderer
+from dlo_gym.scene.ur5e import link_frames
 from sim2real.cameras.camera import CameraSettings
 from sim2real.cameras.mjpeg_camera import MjpegCamera
 from sim2real.config import TEMPLATES, CellConfig

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from dlo_gym.geometry.se3 import exp_so3, pose
-from dlo_gym.scene.arms import CAPSULES, DualArm, link_frames
+from dlo_gym.scene.arms import DualArm
 from dlo_gym.scene.builder import MULTISAMPLES, SceneConfig, build_spec, default_cameras
+from dlo_gym.scene.clearance import CAPSULES
+from dlo_gym.scene.ur5e import link_frames
 
 
 def compiled(**settings):
