@@ -74,20 +74,17 @@ def control_steps(
     Raises:
         SafetyStop, DeviceError, TrackLost, SolverFailed: after both arms were told to stop.
     """
-    begins = False
-    try:
-        first = cell.refresh()
-    except DeviceError:
-        if recoveries <= 0 or not cell.under_control:
-            raise
-        recoveries, begins = recoveries - 1, True
-        first = _recover(cell, 10.0)
-    _warm_up(cell, loop, first)
-    period, origin = cell.config.control.period_s, first.stamp
-    yield _step(cell, loop, first, origin)
-    tick, made = time.monotonic(), 0
+    period, origin = cell.config.control.period_s, None
+    tick, begins, made = 0.0, False, 0
     while made < steps:
         try:
+            if origin is None:
+                first = cell.refresh()
+                _warm_up(cell, loop, first)
+                step = _step(cell, loop, first, first.stamp)
+                origin = first.stamp
+                yield replace(step, begins=begins)
+                tick, begins = time.monotonic(), False
             if not dry_run and not cell.under_control:
                 cell.engage()
                 loop.resume(cell.commanded)
@@ -102,11 +99,10 @@ def control_steps(
             cell.wait_until(tick)
         except (SafetyStop, DeviceError) as stop:
             cell.halt()
-            if recoveries <= 0 or not _is_passing(stop):
+            if recoveries <= 0 or not cell.under_control or not _is_passing(stop):
                 raise
             recoveries -= 1
-            _recover(cell, 10.0)
-            loop.resume(cell.commanded)
+            _recover(cell, loop, 10.0)
             tick, begins = time.monotonic(), True
         except BaseException:
             cell.halt()
@@ -150,13 +146,15 @@ def _is_passing(stop: SafetyStop | DeviceError) -> bool:
     return isinstance(stop, DeviceError) or stop.limit in PASSING
 
 
-def _recover(cell: RobotCell, timeout: float) -> CellSample:
-    """Tries to make the cell ready again until ``timeout`` [s] has passed; its first images."""
+def _recover(cell: RobotCell, loop: ClosedLoop, timeout: float) -> None:
+    """Tries to make cell and loop ready again until ``timeout`` [s] has passed."""
     deadline = time.monotonic() + timeout
     while True:
         try:
             cell.recover()
-            return cell.refresh()
+            cell.refresh()
+            loop.resume(cell.commanded)
+            return
         except DeviceError:
             cell.halt()
             if time.monotonic() > deadline:

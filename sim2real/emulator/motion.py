@@ -10,15 +10,13 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numba import njit
 
 from sim2real.emulator import kinematics
+from sim2real.emulator._kernels_motion import TICK, joint_velocity, largest_gap, ramp, servo
 from sim2real.emulator.kinematics import SINGULAR_DETERMINANT, Array
+from sim2real.emulator.trapezoid import TrapezoidPath, pose_between, way_length
 
-TICK = 0.002  # s, the controller's cycle: 500 Hz
 JOINT_LIMIT = 2.0 * math.pi  # every joint turns +-360 degrees
-# A turn of the tool counts as this much way [m/rad], in moves that turn more than they shift.
-TURN_LENGTH = 0.25
 _ZERO = np.zeros(6)
 
 
@@ -84,7 +82,7 @@ class Motion:
         self._wanted = np.zeros(6)  # of a speed command: joint or tool velocity
         self._tool_speed = np.zeros(6)  # ramped towards it, base axes
         self._acceleration = 1.0
-        self._path: _Path | None = None
+        self._path: TrapezoidPath | None = None
         self._move: _Move | None = None
         self._stop_by_tool = False
         self._speed_fraction = 1.0
@@ -111,7 +109,7 @@ class Motion:
     def servo_joints(self, target: Array) -> None:
         """Follow a joint target (6,) [rad] with the servo's lag."""
         _check_within_range(target)
-        jump = _largest_gap(target, self.q)
+        jump = largest_gap(target, self.q)
         if jump > self.limits.servo_jump:
             raise MotionFault(f"servo target is {jump:.2f} rad away from the joints")
         self.target[:] = target
@@ -179,8 +177,8 @@ class Motion:
         else:
             start, way = kinematics.forward(self.q, self.T_flange_tcp), np.empty(6)
             kinematics.pose_difference(start, move.goal, way)
-            length = _way_length(way)
-        self._path = _Path(start, way, length, speed, acceleration)
+            length = way_length(way)
+        self._path = TrapezoidPath(start, way, length, speed, acceleration)
         self.mode = move.mode
 
     def stop(self, deceleration: float, *, by_tool: bool = False) -> None:
@@ -226,7 +224,7 @@ class Motion:
             self.qdd[:] = 0.0
             return
         if self.mode is Mode.SERVO:
-            _servo(
+            servo(
                 *(self.q, self.qd, self.qdd, self.target, limits.servo_lag),
                 *(limits.joint_speed, limits.joint_acceleration),
             )
@@ -236,7 +234,7 @@ class Motion:
         if self.mode is Mode.SPEED_JOINTS:
             wanted = np.clip(self._wanted, -limits.joint_speed, limits.joint_speed)
             bound = min(self._acceleration, limits.joint_acceleration)
-            _ramp(self.q, self.qd, wanted, bound)
+            ramp(self.q, self.qd, wanted, bound)
         elif self.mode is Mode.SPEED_TOOL:
             self._step_tool_speed()
         elif self.mode is Mode.STOP:
@@ -248,29 +246,29 @@ class Motion:
         self._check_range()
 
     def _check_range(self) -> None:
-        if _largest_gap(self.q, _ZERO) > JOINT_LIMIT:
+        if largest_gap(self.q, _ZERO) > JOINT_LIMIT:
             self.q[:] -= self.qd * TICK
             raise MotionFault("a joint is at the end of its range")
 
     def _step_tool_speed(self) -> None:
         gap = self._wanted - self._tool_speed
-        length = _way_length(gap)
+        length = way_length(gap)
         most = self._acceleration * TICK
         self._tool_speed += gap * min(1.0, most / length) if length > 0.0 else gap
         wanted = np.empty(6)
-        determinant = _joint_velocity(self.q, self.qd, self.T_flange_tcp, self._tool_speed, wanted)
+        determinant = joint_velocity(self.q, self.qd, self.T_flange_tcp, self._tool_speed, wanted)
         if determinant < SINGULAR_DETERMINANT:
             raise MotionFault("the arm is too close to a singularity")
         if np.abs(wanted).max() > self.limits.joint_speed:
             raise MotionFault("a joint would have to turn faster than it can")
-        _ramp(self.q, self.qd, wanted, self.limits.joint_acceleration)
+        ramp(self.q, self.qd, wanted, self.limits.joint_acceleration)
 
     def _step_stop(self) -> None:
         speed = float(np.abs(self.qd).max())
         if self._stop_by_tool:
             T, J = np.empty((4, 4)), np.empty((6, 6))
             kinematics.forward_and_jacobian(self.q, self.T_flange_tcp, T, J)
-            speed = max(_way_length(J @ self.qd), 1e-9)
+            speed = max(way_length(J @ self.qd), 1e-9)
         lost = self._acceleration * TICK / max(speed, 1e-12)
         hardest = (
             2.0 * self.limits.joint_acceleration * TICK / max(float(np.abs(self.qd).max()), 1e-12)
@@ -293,7 +291,7 @@ class Motion:
         if self.mode is Mode.MOVE_JOINTS:
             self.q[:] = path.start + share * path.way
         else:
-            T = _between(path.start, path.way, share)
+            T = pose_between(path.start, path.way, share)
             self.q[:] = self.solve(T, self.q)
         self.qd[:] = (self.q - before) / TICK
         if np.abs(self.qd).max() > self.limits.joint_speed * (1.0 + 1e-9):
@@ -327,56 +325,6 @@ class PausedMotion:
     move: _Move | None
 
 
-class _Path:
-    """A way of ``length`` passed in a trapezoid (or triangle) of speed."""
-
-    def __init__(
-        self, start: Array, way: Array, length: float, speed: float, acceleration: float
-    ) -> None:
-        self.start, self.way = start, way
-        self._length = length
-        self._peak = min(speed, math.sqrt(length * acceleration))
-        self._acceleration = acceleration
-        self._ramp = self._peak / acceleration
-        self._duration = self._ramp + length / self._peak if length > 0.0 else 0.0
-        self._time = 0.0
-
-    @property
-    def done(self) -> bool:
-        return self._time >= self._duration
-
-    def advance(self, duration: float) -> float:
-        """The share 0..1 of the way that is behind after ``duration`` [s] more."""
-        self._time = min(self._time + duration, self._duration)
-        if self.done:
-            return 1.0
-        left = self._duration - self._time
-        if self._time < self._ramp:
-            way = 0.5 * self._acceleration * self._time**2
-        elif left < self._ramp:
-            way = self._length - 0.5 * self._acceleration * left**2
-        else:
-            way = self._peak * (self._time - 0.5 * self._ramp)
-        return way / self._length
-
-
-def _between(start: Array, way: Array, share: float) -> Array:
-    """The pose (4, 4) at ``share`` of the shift and turn ``way`` (6,) from ``start``."""
-    turn = kinematics.transform(np.concatenate([np.zeros(3), share * way[3:]]))
-    T = start.copy()
-    T[:3, :3] = turn[:3, :3] @ start[:3, :3]
-    T[:3, 3] += share * way[:3]
-    return T
-
-
-def _way_length(way: Array) -> float:
-    """Length [m] of a shift and turn (6,), whichever is longer."""
-    x, y, z, rx, ry, rz = way.tolist()
-    return max(
-        math.sqrt(x * x + y * y + z * z), TURN_LENGTH * math.sqrt(rx * rx + ry * ry + rz * rz)
-    )
-
-
 def _positive(value: float) -> float:
     if not (math.isfinite(value) and value > 0.0):
         raise MotionFault(f"expected a speed or acceleration above 0, got {value}")
@@ -384,70 +332,5 @@ def _positive(value: float) -> float:
 
 
 def _check_within_range(target: Array) -> None:
-    if not _largest_gap(target, _ZERO) <= JOINT_LIMIT + 1e-9:
+    if not largest_gap(target, _ZERO) <= JOINT_LIMIT + 1e-9:
         raise MotionFault("a joint target is not a number or outside the joint's range")
-
-
-@njit(cache=True)
-def _largest_gap(first: Array, second: Array) -> float:
-    """The largest |first - second| of (6,); NaN if one is NaN."""
-    largest = 0.0
-    for i in range(6):
-        gap = abs(first[i] - second[i])
-        if not gap <= largest:
-            largest = gap
-        if np.isnan(gap):
-            return gap
-    return largest
-
-
-@njit(cache=True)
-def _servo(
-    q: Array,
-    qd: Array,
-    qdd: Array,
-    target: Array,
-    lag: float,
-    most_speed: float,
-    most_acceleration: float,
-) -> None:
-    """Update q, qd, qdd (6,) by one tick of a first-order lag within speed and acceleration limits.
-
-    The speed also stays below what 0.8 of the acceleration can brake in the way that is left.
-    """
-    change = most_acceleration * TICK
-    for i in range(6):
-        error = target[i] - q[i]
-        away = abs(error)
-        speed = min(away / lag, np.sqrt(1.6 * most_acceleration * away), most_speed)
-        wanted = speed if error > 0.0 else -speed
-        before = qd[i]
-        qd[i] = min(max(wanted, before - change), before + change)
-        if away < 1e-10 and abs(qd[i]) < 1e-8:
-            qd[i] = 0.0
-            q[i] = target[i]
-        q[i] += qd[i] * TICK
-        qdd[i] = (qd[i] - before) / TICK
-
-
-@njit(cache=True)
-def _ramp(q: Array, qd: Array, wanted: Array, acceleration: float) -> None:
-    """Update q, qd (6,) by one tick towards ``wanted``, the leading joint at the limit."""
-    largest = 0.0
-    for i in range(6):
-        largest = max(largest, abs(wanted[i] - qd[i]))
-    share = min(1.0, acceleration * TICK / largest) if largest > 0.0 else 1.0
-    for i in range(6):
-        qd[i] += share * (wanted[i] - qd[i])
-        q[i] += qd[i] * TICK
-
-
-@njit(cache=True)
-def _joint_velocity(q: Array, qd: Array, tool: Array, velocity: Array, out: Array) -> float:
-    """Update joint velocities ``out`` (6,) of a TCP velocity (6,) half a tick ahead; |det J|."""
-    T, J, ahead = np.empty((4, 4)), np.empty((6, 6)), np.empty(6)
-    for i in range(6):
-        ahead[i] = q[i] + 0.5 * TICK * qd[i]
-        out[i] = velocity[i]
-    kinematics.forward_and_jacobian(ahead, tool, T, J)
-    return kinematics.solve6(J, out)

@@ -239,11 +239,12 @@ def test_ctrl_c_keeps_a_checkpoint_to_resume_from(tmp_path, monkeypatch, step):
             signal.raise_signal(signal.SIGINT)
         return on_step(log)
 
+    handler = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(rl.TrainingLog, "_on_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         rl.train_rl(tmp_path / "run", **SMALL)
     assert [p.name for p in (tmp_path / "run").glob("checkpoint*")] == [f"checkpoint-{step:09d}"]
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is handler
     monkeypatch.undo()
     rl.train_rl(tmp_path / "run", **SMALL, resume=True)
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["steps"] == 140

@@ -29,7 +29,9 @@ def finished(emulated, tmp_path_factory):
     """The folder of a run that was left to itself."""
     _, file = emulated
     out = tmp_path_factory.mktemp("run") / "run"
-    assert cli.main(["robot", "run", str(file), "--steps", "60", "--out", str(out)]) == 0
+    # On a busy machine a stream may freeze for a moment.
+    arguments = ["--steps", "60", "--recoveries", "5", "--out", str(out)]
+    assert cli.main(["robot", "run", str(file), *arguments]) == 0
     return out
 
 

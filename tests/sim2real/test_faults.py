@@ -23,14 +23,14 @@ HALT_WITHIN = 3.0  # [s]
 FAULTS = [
     # fault, seconds, which part, what the message must say
     ("drop_link", None, "left", "left arm"),
-    ("freeze", 1.5, "right", "right arm"),
+    pytest.param("freeze", 1.5, "right", "right arm", marks=pytest.mark.slow),
     ("protective_stop", None, "left", "protective stop"),
     pytest.param("freeze", 0.7, "left", "left arm", marks=pytest.mark.slow),
     pytest.param("freeze", 4.0, "left", "left arm", marks=pytest.mark.slow),
     pytest.param("emergency_stop", None, "right", "emergency stop", marks=pytest.mark.slow),
     pytest.param("crash", None, "right", "right arm", marks=pytest.mark.slow),
     pytest.param("freeze", 3.0, "side", "side", marks=pytest.mark.slow),
-    ("kill client", None, "left", "SIGKILL"),
+    pytest.param("kill client", None, "left", "SIGKILL", marks=pytest.mark.slow),
 ]
 
 
