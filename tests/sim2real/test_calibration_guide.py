@@ -34,7 +34,7 @@ def collect(command):
     """Fewer poses, faster; cut off by a busy machine's watchdog it goes on, as the guide says."""
     poses = str(POSES[option(command, "--samples")])
     command = [*command, "--poses", poses, "--joint-speed", "1.0"]
-    assert any(cli.main(command) == 0 for _ in range(5)), command
+    assert any(cli.main(command) == 0 for _ in range(10)), command
 
 
 def off_truth(cell, world):

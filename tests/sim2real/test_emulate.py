@@ -17,6 +17,7 @@ from sim2real.emulator import emulate
 from sim2real.emulator.emulated_cell import EmulatedCell
 from sim2real.emulator.rtde_reader import RtdeReader
 from sim2real.emulator.world_config import WorldConfig
+from sim2real.truth_source import TruthSource
 from tests.sim2real.fake_controller import free_address
 
 ARMS = DualArm()
@@ -91,6 +92,8 @@ def test_board_goes_from_gripper_to_gripper_with_both_arms_home(cell):
     assert said == "board right: done, both arms are home"
     truth = cell.truth()
     assert truth.board == "right"
+    with pytest.raises(DeviceError, match="board none"):
+        TruthSource(f"{cell.world.url}/truth").newest()
     np.testing.assert_allclose(truth.joint_angles, ARMS.home, atol=1e-4)
     assert "board in the right gripper" in emulate.run_command(cell, "status")
     emulate.run_command(cell, "board left")
