@@ -10,13 +10,17 @@ from sim2real.config import TEMPLATES
 
 
 def init(
-    file: Path = Path("cell.toml"), /, *, template: Literal["ur5e", "emulated"] = "ur5e"
+    file: Path = Path("cell.toml"),
+    /,
+    *,
+    template: Literal["ur5e", "emulated", "uncalibrated"] = "ur5e",
 ) -> None:
     """Write a cell file to start from; every value that a lab must measure is marked EDIT.
 
     Args:
         file: to write; an existing one is never replaced.
-        template: ur5e for two real arms, emulated for those of `dlo robot emulate --world`.
+        template: ur5e for two real arms, emulated for those of `dlo robot emulate --world`,
+            uncalibrated for the same with larger images and roughly measured poses.
     """
     if file.exists():
         raise FileExistsError(f"{file} exists; name another file")

@@ -26,13 +26,14 @@ class TruthSource:
         """The truth at the monotonic time ``stamp`` [s] of images that the world rendered.
 
         Raises:
-            DeviceError: if the world does not answer, or knows nothing of that time.
+            DeviceError: if the world does not answer, holds no cable, or knows nothing of that
+                time.
         """
         deadline = time.monotonic() + self.timeout
         while True:
             for truth in self._since(stamp - TOLERANCE):
                 if abs(truth.stamp - stamp) < TOLERANCE:
-                    return truth
+                    return self._of_a_cable(truth)
             if time.monotonic() > deadline:
                 raise DeviceError(f"{self.url}: knows no truth of {stamp:.6f} s")
             time.sleep(0.01)
@@ -41,9 +42,17 @@ class TruthSource:
         """The truth of the newest images.
 
         Raises:
-            DeviceError: if the world does not answer.
+            DeviceError: if the world does not answer, or holds no cable.
         """
-        return WorldTruth.from_json(self._get(self.url))
+        return self._of_a_cable(WorldTruth.from_json(self._get(self.url)))
+
+    def _of_a_cable(self, truth: WorldTruth) -> WorldTruth:
+        if truth.board is not None:
+            raise DeviceError(
+                f"{self.url}: the {truth.board} gripper carries a calibration board and there is no"
+                " cable; type  board none  where the cell is emulated"
+            )
+        return truth
 
     def _since(self, stamp: float) -> list[WorldTruth]:
         history = self._get(f"{self.url}?since={stamp:.6f}")["history"]

@@ -35,7 +35,7 @@ class SceneConfig:
     Attributes:
         cameras: fixed cameras, each with a name of its own.
         rod_radius: of the drawn rod [m].
-        n_nodes: of the rod's centerline.
+        n_nodes: of the rod's centerline; 0 where there is no rod.
         rod_color: RGB in [0, 1].
         clutter: "none", or "industrial" parts on the table (the paper's scenario S2).
         n_distractor_cables: other cables lying on the table.
@@ -74,8 +74,8 @@ class SceneConfig:
             raise ValueError(f"cameras: expected at least one, with distinct names, got {names}")
         if not 0.0 < self.rod_radius < 0.05:
             raise ValueError(f"rod_radius: expected 0 < radius < 0.05 m, got {self.rod_radius}")
-        if self.n_nodes < 2:
-            raise ValueError(f"n_nodes: expected at least 2, got {self.n_nodes}")
+        if self.n_nodes < 2 and self.n_nodes != 0:
+            raise ValueError(f"n_nodes: expected at least 2, or 0 for no rod, got {self.n_nodes}")
         color = np.asarray(self.rod_color, dtype=np.float64)
         if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
             raise ValueError(f"rod_color: expected RGB in [0, 1], got {self.rod_color}")

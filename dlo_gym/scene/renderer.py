@@ -77,7 +77,7 @@ class SceneRenderer:
         """Poses rod, arms and occluders.
 
         Args:
-            positions: (n_nodes, 3) centerline in world [m].
+            positions: (n_nodes, 3) centerline in world [m]; (0, 3) where there is no rod.
             boundary: the clamps that the grippers hold.
             occluder_positions: (n_occluders, 3) centres in world [m]; NaN, like None, hides.
             joint_angles: (2, 6) [rad]; by inverse kinematics from the last ones when omitted.
@@ -165,6 +165,8 @@ class SceneRenderer:
         """
         camera = self._lens(camera_name).camera
         positions = self._require_positions()
+        if len(positions) == 0:
+            return np.zeros(0, dtype=bool)
         facing = _facing_points(positions, camera.centre, self.config.rod_radius)
         rays = facing - camera.centre
         distances = np.linalg.norm(rays, axis=1)

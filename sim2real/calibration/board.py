@@ -6,7 +6,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 from rich.console import Console
@@ -237,6 +236,9 @@ def save_board(spec: BoardSpec, path: Path) -> None:
             dpi = pixels_per_square / spec.square_length_m * _METRES_PER_INCH
             Image.fromarray(picture).save(part, "PNG", dpi=(dpi, dpi))
             return
+        # Takes long to import, and who only looks for a board draws none.
+        from matplotlib.figure import Figure
+
         figure = Figure(figsize=(width / _METRES_PER_INCH, height / _METRES_PER_INCH))
         axes = figure.add_axes(
             (margin / width, margin / height, 1 - 2 * margin / width, 1 - 2 * margin / height)

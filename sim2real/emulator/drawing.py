@@ -11,7 +11,7 @@ from dlo_gym.envs.cell import sample_occluder_paths
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.scene.renderer import SceneRenderer
 from sim2real.emulator.held_rod import HeldShape
-from sim2real.emulator.world_config import WorldConfig
+from sim2real.emulator.world_config import Gripper, WorldConfig
 
 _JPEG = [
     *(cv2.IMWRITE_JPEG_QUALITY, 95),
@@ -28,11 +28,13 @@ class Snapshot:
         stamp: monotonic [s].
         joint_angles: (2, 6) [rad].
         shape: the rod between the grippers.
+        board: side of the gripper that carries a calibration board instead; None if none does.
     """
 
     stamp: float
     joint_angles: Array
     shape: HeldShape
+    board: Gripper | None = None
 
 
 class Drawn(NamedTuple):
@@ -53,7 +55,7 @@ class Drawing(Protocol):
 
 
 class CellDrawing:
-    """The cell with its arms, the rod, clutter and occluders that pass by."""
+    """The cell with its arms, the rod or a board, clutter and occluders that pass by."""
 
     def __init__(self, config: WorldConfig) -> None:
         self._config = config
@@ -65,6 +67,10 @@ class CellDrawing:
     def draw(self, snapshot: Snapshot) -> dict[str, Drawn]:
         if self._began is None:
             self._began = snapshot.stamp
+        if snapshot.board != self._config.board:
+            self._renderer.close()
+            self._config = self._config.carrying(snapshot.board)
+            self._renderer = SceneRenderer(self._config.scene)
         elapsed = snapshot.stamp - self._began
         occluders = np.array([path.position(elapsed) for path in self._paths])
         shape = snapshot.shape

@@ -24,7 +24,7 @@ from dlo_gym.scene.arms import SIDES
 from dlo_gym.scene.builder import default_cameras
 from sim2real.config import CellConfig
 from sim2real.emulator.emulated_cell import EmulatedCell
-from sim2real.emulator.world_config import WorldConfig
+from sim2real.emulator.world_config import Gripper, WorldConfig
 
 PORTS = {
     29999: "dashboard",
@@ -33,10 +33,12 @@ PORTS = {
     63352: "Robotiq gripper",
     63999: "control port: wrench, faults",
 }
+BOARDS: dict[str, Gripper | None] = {"left": "left", "right": "right", "none": None}
 HELP = """\
 left | right  FAULT [seconds]     freeze 1.5, drop_link, refuse 2, mute, protective_stop,
                                   emergency_stop, release_emergency_stop, clear, crash
 camera NAME  FAULT seconds        freeze 2, drop 2, latency 0.1; clear ends freezing and dropping
+board left | right | none         a calibration board in place of the cable; both arms go home
 status                            what the arms and the world do
 help, quit"""
 _REFRESH = 0.5
@@ -52,6 +54,7 @@ def emulate(
     port: int | None = None,
     rate: float = 20.0,
     image_height: int = 360,
+    board: Literal["none", "left", "right"] = "none",
     clutter: bool = False,
     occluders: int = 0,
     quality: Literal["fast", "high"] = "fast",
@@ -71,6 +74,8 @@ def emulate(
         port: where the cameras are served (8080).
         rate: sets of pictures per second; fewer where the processor does not keep up.
         image_height: of all views [pixels], 16:9; a cell file's cameras have their own.
+        board: put a calibration board into this gripper, in place of the cable; `board right`
+            typed later swaps it.
         clutter: put industrial parts and other cables into the scene.
         occluders: panels that pass in front of the cameras.
         quality: of the rendering; high has shadows and antialiasing and takes several times longer.
@@ -84,6 +89,7 @@ def emulate(
         "n_distractor_cables": 3 if clutter else 0,
         "n_occluders": occluders,
         "quality": quality,
+        "board": BOARDS[board],
         "seed": seed,
     }
     options |= {"address": address} if address else {}
@@ -204,6 +210,11 @@ def run_command(emulated: EmulatedCell, line: str, *, world: bool = True) -> str
         return HELP
     if words == ["status"]:
         return status_line(emulated, world=world)
+    if words[:1] == ["board"]:
+        if len(words) != 2 or words[1] not in BOARDS:
+            raise ValueError("board: expected left, right or none after it")
+        emulated.carry(BOARDS[words[1]])
+        return f"{' '.join(words)}: done, both arms are home"
     if words[:1] == ["camera"]:
         words = words[1:]
         if words[:1] in ([], ["left"], ["right"]):
@@ -237,6 +248,8 @@ def status_line(emulated: EmulatedCell, *, world: bool) -> str:
     if world:
         try:
             status = emulated.world.status()
+            if status["board"]:
+                parts.append(f"board in the {status['board']} gripper")
             distance = status["rod"]["distance_m"]
             if distance is not None:
                 parts.append(f"grippers {1e3 * distance:.1f} mm apart")

@@ -20,7 +20,7 @@ from sim2real.emulator.emulated_world import EmulatedWorld
 from sim2real.emulator.process import EmulatedController
 from sim2real.emulator.rtde_reader import PORT as RTDE_PORT
 from sim2real.emulator.truth import WorldTruth
-from sim2real.emulator.world_config import WorldConfig
+from sim2real.emulator.world_config import Gripper, WorldConfig
 
 PLACED_WITHIN = 1e-4  # of the joint angles asked for [rad]
 _PLACE_TIMEOUT = 10.0
@@ -91,9 +91,7 @@ class EmulatedCell:
             _check_free(address)
         try:
             if self._with_world:
-                # The slowest first: it starts while the controllers do.
-                self._stack.callback(self.world.stop)
-                self.world.launch()
+                self.world.launch()  # the slowest first: it starts while the controllers do
             for side, address in zip(SIDES, self.config.controllers, strict=True):
                 controller = EmulatedController(address)
                 self.controllers[side] = self._stack.enter_context(controller)
@@ -107,6 +105,7 @@ class EmulatedCell:
 
     def stop(self) -> None:
         """Ends all processes; stopping twice does no harm."""
+        self.world.stop()  # before it could miss the controllers
         self._stack.close()
         self.controllers = {}
 
@@ -125,6 +124,20 @@ class EmulatedCell:
         self.world.settle()
         # The rod settles with the next sample, the pictures that show it come after.
         self._wait_for(joint_angles, time.monotonic() + 0.1)
+
+    def carry(self, board: Gripper | None) -> None:
+        """Sets the arms, which must stand, home at once and puts the calibration board into a
+        gripper in place of the rod; None brings the rod back. Returns when pictures show it.
+
+        Raises:
+            ValueError: if an arm moves, or there is no world.
+            DeviceError: if the world does not follow.
+        """
+        if not self._with_world:
+            raise ValueError("board: there is nothing to carry without a world")
+        self._teleport(self.config.dual_arm.home)
+        self.world.carry(board)
+        self._wait_for(self.config.dual_arm.home, time.monotonic())
 
     def truth(self, stamp: float | None = None) -> WorldTruth:
         """What was true at a picture's ``stamp``; of the newest picture when omitted."""

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 from dlo_gym.exceptions import DeviceError
 from sim2real.emulator.truth import WorldTruth
-from sim2real.emulator.world_config import WorldConfig
+from sim2real.emulator.world_config import Gripper, WorldConfig
 
 START_TIMEOUT = 60.0  # the first start on a machine compiles the rod's kernels [s]
 STOP_TIMEOUT = 5.0
@@ -145,6 +145,13 @@ class EmulatedWorld:
     def settle(self) -> None:
         """Hangs the rod anew between the grippers, whatever its past."""
         self._json("POST", "/settle", {})
+
+    def carry(self, board: Gripper | None) -> None:
+        """Puts the calibration board into a gripper in place of the rod; None brings the rod back.
+
+        Pictures and truth follow as soon as the new scene is drawn.
+        """
+        self._json("POST", "/board", {"side": board})
 
     def truth(self, stamp: float | None = None) -> WorldTruth:
         """What was true at a picture's ``stamp``, nearest in time; of the newest when omitted.

@@ -25,7 +25,7 @@ class HeldShape:
     """The rod as the world shows it.
 
     Attributes:
-        positions: (n_nodes, 3) centerline in world [m].
+        positions: (n_nodes, 3) centerline in world [m]; (0, 3) where no rod is held.
         boundary: the clamp poses.
         wrenches: (2, 6) force [N] and torque [N m] that the left and the right clamp exert on the
             rod at its end nodes, world axes.
@@ -36,6 +36,11 @@ class HeldShape:
     boundary: BoundaryPoses
     wrenches: Array
     problem: str = ""
+
+    @classmethod
+    def nothing(cls, boundary: BoundaryPoses) -> "HeldShape":
+        """Of grippers at ``boundary`` that hold no rod, and so feel none."""
+        return cls(np.zeros((0, 3)), boundary, np.zeros((2, 6)))
 
 
 class HeldRod:

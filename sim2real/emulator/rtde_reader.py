@@ -27,6 +27,7 @@ _SAMPLE = struct.Struct(">B7d")
 _HANDSHAKE_TIMEOUT = 1.0
 _SILENCE = 2.0  # after which a link is given up [s]
 _RETRY = 0.2  # between two attempts to connect [s]
+_PATIENCE = 3.0  # with a controller that starts or stops, before it is worth a warning [s]
 _KEPT = 2.0  # of the joint angles' history [s]
 _CLOCK_WINDOW = 5.0
 _CLOCK_JUMP = 1.0
@@ -133,7 +134,7 @@ class RtdeReader:
         self._thread.join(timeout=_SILENCE + _HANDSHAKE_TIMEOUT)
 
     def _run(self) -> None:
-        where, reported = (self.address, self.port), False
+        where, lost_at, reported = (self.address, self.port), time.monotonic(), False
         while not self._closing.is_set():
             try:
                 with socket.create_connection(
@@ -141,7 +142,10 @@ class RtdeReader:
                 ) as link:
                     self._read(link)
             except (OSError, ValueError) as error:
-                if self.connected or not reported:
+                now = time.monotonic()
+                if self.connected:
+                    lost_at, reported = now, False
+                if now - lost_at > _PATIENCE and not reported:
                     _log.warning("RTDE %s:%d: %s; retrying", *where, error)
                     reported = True
             self.connected = False

@@ -14,6 +14,7 @@ from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryPoses
 from dlo_gym.scene.arms import SIDES
 from sim2real.emulator.drawing import Drawn, Snapshot
+from sim2real.emulator.world_config import Gripper
 
 KEPT = 120.0  # [s]
 MOST_AT_ONCE = 200  # entries of one answer
@@ -25,12 +26,13 @@ class WorldTruth:
 
     Attributes:
         stamp: monotonic [s], the very X-Timestamp of the pictures.
-        centerline: (n_nodes, 3) in world [m].
+        centerline: (n_nodes, 3) in world [m]; (0, 3) where no rod is held.
         visible: by camera, (n_nodes,) which nodes it saw.
         boundary: the clamp poses.
         joint_angles: (2, 6) of the left and the right arm [rad].
         wrenches: (2, 6) of the clamps on the rod, world axes [N], [N m].
         problem: why the rod is in no equilibrium (overstretched); empty if it is.
+        board: side of the gripper that carries a calibration board; None if none does.
     """
 
     stamp: float
@@ -40,18 +42,20 @@ class WorldTruth:
     joint_angles: Array
     wrenches: Array
     problem: str
+    board: Gripper | None = None
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> "WorldTruth":
         """From one object of the ``/truth`` page."""
         return cls(
             stamp=value["stamp"],
-            centerline=np.array(value["centerline"]),
-            visible={name: np.array(seen) for name, seen in value["visible"].items()},
+            centerline=np.array(value["centerline"], dtype=np.float64).reshape(-1, 3),
+            visible={name: np.array(seen, dtype=bool) for name, seen in value["visible"].items()},
             boundary=BoundaryPoses(*(np.array(value["clamps"][side]) for side in SIDES)),
             joint_angles=np.array([value["joints"][side] for side in SIDES]),
             wrenches=np.array([value["wrenches"][side] for side in SIDES]),
             problem=value["problem"],
+            board=value["board"],
         )
 
 
@@ -95,6 +99,7 @@ def _text(snapshot: Snapshot, drawn: Mapping[str, Drawn]) -> str:
         "joints": _by_side(snapshot.joint_angles, 7),
         "wrenches": _by_side(snapshot.shape.wrenches, 6),
         "problem": snapshot.shape.problem,
+        "board": snapshot.board,
     }
     return json.dumps(value, separators=(",", ":"), allow_nan=False)
 

@@ -1,4 +1,4 @@
-"""The simulated world behind two emulated controllers: rod, forces, cameras, truth.
+"""The simulated world behind two emulated controllers: rod or board, forces, cameras, truth.
 
 One process: ``python -m sim2real.emulator.world --config FILE``; from Python, ``EmulatedWorld``.
 It reads where the arms are over RTDE, lets the rod follow the grippers, tells each controller the
@@ -29,7 +29,7 @@ from sim2real.emulator.drawing import CellDrawing, Drawing, Snapshot, encode
 from sim2real.emulator.held_rod import HeldRod, HeldShape
 from sim2real.emulator.mjpeg_server import Answer, MjpegServer
 from sim2real.emulator.truth import TruthHistory
-from sim2real.emulator.world_config import WorldConfig, check_seconds
+from sim2real.emulator.world_config import Gripper, WorldConfig, check_seconds
 
 ROD_RATE = 40.0  # at which the rod follows the grippers [Hz]
 WRENCH_EVERY = 2  # of these steps the controllers are told the wrench
@@ -57,7 +57,10 @@ class World:
         self._make_drawing = make_drawing
         self._rod = HeldRod(config.rod, config.n_elements, config.overstretch_stiffness)
         # Loads the rod's compiled kernels and gives the first drawing something to draw.
-        self._home = self._rod.follow(config.dual_arm.forward_kinematics(config.dual_arm.home))
+        home = config.dual_arm.forward_kinematics(config.dual_arm.home)
+        settled = self._rod.follow(home)
+        self._home = settled if config.board is None else HeldShape.nothing(home)
+        self._board: Gripper | None = config.board
         self._links = [ControllerLink(address) for address in config.controllers]
         self._feeds = {
             camera.name: CameraFeed(config.latency.get(camera.name, 0.0))
@@ -161,9 +164,17 @@ class World:
             self._settle_anew.clear()
             self._rod.forget()
             last = None
-        if last is not None and np.array_equal(joint_angles, last.joint_angles):
-            return Snapshot(stamp, joint_angles, last.shape)
+        board = self._board
+        if (
+            last is not None
+            and board == last.board
+            and np.array_equal(joint_angles, last.joint_angles)
+        ):
+            return Snapshot(stamp, joint_angles, last.shape, board)
         boundary = self.config.dual_arm.forward_kinematics(joint_angles)
+        if board is not None:
+            self._rod.forget()  # it hangs anew when it is back
+            return Snapshot(stamp, joint_angles, HeldShape.nothing(boundary), board)
         return Snapshot(stamp, joint_angles, self._rod.follow(boundary))
 
     def _wrenches_on_grippers(self, shape: HeldShape) -> Array:
@@ -178,7 +189,8 @@ class World:
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
         drawing = self._make_drawing(self.config)
         try:
-            drawing.draw(Snapshot(time.monotonic(), self.config.dual_arm.home, self._home))
+            home = self.config.dual_arm.home
+            drawing.draw(Snapshot(time.monotonic(), home, self._home, self.config.board))
             self._drawable.set()
             pause, drawn_stamp = 0.0, -math.inf
             while not self._closing.wait(pause):
@@ -218,10 +230,17 @@ class World:
 
     def post(self, path: str, body: Any) -> Answer | None:
         """``/fault`` {"camera": name, "freeze" | "drop" | "latency": seconds} or "clear": true;
-        ``/settle`` {} hangs the rod anew between the grippers, whatever its past."""
+        ``/settle`` {} hangs the rod anew between the grippers, whatever its past; ``/board``
+        {"side": "left" | "right"} takes the rod away and gives that gripper the calibration
+        board, null takes the board away and brings the rod back."""
         if path == "/settle":
             self._settle_anew.set()
             return Answer.of({"ok": True})
+        if path == "/board":
+            if not isinstance(body, dict) or body.get("side", "") not in (None, *SIDES):
+                raise ValueError('expected {"side": "left", "right" or null}')
+            self._board = body["side"]
+            return Answer.of({"ok": True, "board": self._board})
         if path != "/fault":
             return None
         if not isinstance(body, dict) or body.get("camera") not in self._feeds:
@@ -252,6 +271,7 @@ class World:
             "processor": round(time.process_time() / elapsed, 3),
             "stamp": None if snapshot is None else round(snapshot.stamp, 6),
             "sets_drawn": self._n_drawn,
+            "board": None if snapshot is None else snapshot.board,
             "rod": {
                 "problem": "" if snapshot is None else snapshot.shape.problem,
                 "distance_m": None

@@ -12,10 +12,16 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from dlo_gym.geometry.camera import CameraModel
+from dlo_gym.geometry.se3 import Array, check_single_pose, exp_so3, pose
 from dlo_gym.rod.properties import RodProperties
 from dlo_gym.scene.arms import SIDES, DualArm
+from dlo_gym.scene.board import BoardPlate
 from dlo_gym.scene.builder import SceneConfig, default_cameras
+from sim2real.calibration.board import BoardSpec
+from sim2real.calibration.plan import nominal_mount
 from sim2real.config import CellConfig
+
+Gripper = Literal["left", "right"]  # that carries the board, where one is carried
 
 DEFAULT_CONTROLLERS = ("127.0.0.2", "127.0.0.3")
 DEFAULT_ADDRESS = "127.0.0.4"
@@ -23,6 +29,8 @@ DEFAULT_PORT = 8080
 IMAGE_SCALE = 1 / 3  # of the scene's 1920x1080 cameras
 LARGEST_RATE = 120.0
 LARGEST_LATENCY = 5.0
+_PIXELS_PER_SQUARE = 128  # of the drawn board
+_GRIPPED_OFF = (0.002, 0.03)  # a board from where it was meant to be gripped [m], [rad]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +51,11 @@ class WorldConfig:
             would take more. By default a fifth per core that the process may use.
         latency: by camera, how much later than drawn its pictures are served [s].
         clutter, n_distractor_cables, n_occluders, occluder_size, rod_color, quality: of the scene.
-        seed: of the distractor cables and the occluders' paths.
+        seed: of the distractor cables, the occluders' paths and how boards are gripped.
+        board: side of the gripper that carries a calibration board; there is no rod then.
+        board_spec: what is printed on it.
+        T_tcp_board: (4, 4) where it is gripped; when omitted, a few millimetres and degrees off
+            ``nominal_mount``, in each gripper differently.
 
     Raises:
         ValueError: naming the field; also on an address outside 127.0.0.0/8.
@@ -67,6 +79,9 @@ class WorldConfig:
     rod_color: tuple[float, float, float] = SceneConfig.rod_color
     quality: Literal["fast", "high"] = "fast"
     seed: int = 0
+    board: Gripper | None = None
+    board_spec: BoardSpec = field(default_factory=BoardSpec)
+    T_tcp_board: Array | None = None
 
     def __post_init__(self) -> None:
         for name in ("cameras", "controllers", "occluder_size", "rod_color"):
@@ -99,6 +114,11 @@ class WorldConfig:
             raise ValueError(f"n_elements: expected at least 2, got {self.n_elements}")
         if self.seed < 0:
             raise ValueError(f"seed: expected 0 or more, got {self.seed}")
+        if self.board not in (None, *SIDES):
+            raise ValueError(f"board: expected left, right or None, got {self.board!r}")
+        if self.T_tcp_board is not None:
+            given = check_single_pose(self.T_tcp_board, "T_tcp_board")
+            object.__setattr__(self, "T_tcp_board", given)
         _ = self.scene
 
     @property
@@ -107,7 +127,8 @@ class WorldConfig:
         return SceneConfig(
             cameras=self.cameras,
             rod_radius=float(np.max(self.rod.radius)),
-            n_nodes=self.n_elements + 1,
+            n_nodes=self.n_elements + 1 if self.board is None else 0,
+            boards=() if self.board is None else (self._plate(self.board),),
             rod_color=self.rod_color,
             clutter=self.clutter,
             n_distractor_cables=self.n_distractor_cables,
@@ -117,6 +138,19 @@ class WorldConfig:
             seed=self.seed,
             arms=self.dual_arm,
         )
+
+    def board_mount(self, side: Gripper) -> Array:
+        """``T_tcp_board`` (4, 4) of the board when this side's gripper carries it."""
+        if self.T_tcp_board is not None:
+            return self.T_tcp_board
+        rng = np.random.default_rng([self.seed, SIDES.index(side)])
+        metres, radians = _GRIPPED_OFF
+        turn = exp_so3(radians * rng.standard_normal(3))
+        return nominal_mount(self.board_spec) @ pose(turn, metres * rng.standard_normal(3))
+
+    def _plate(self, side: Gripper) -> BoardPlate:
+        picture = self.board_spec.image(_PIXELS_PER_SQUARE)
+        return BoardPlate(side, picture, self.board_spec.size_m, self.board_mount(side))
 
     @property
     def url(self) -> str:
@@ -155,6 +189,7 @@ class WorldConfig:
             for camera in self.cameras
         ]
         values["rod"] = asdict(self.rod)
+        values["board_spec"] = asdict(self.board_spec)
         values["dual_arm"] = {one.name: getattr(self.dual_arm, one.name) for one in fields(DualArm)}
         values["latency"] = dict(self.latency)
         return json.dumps(values, default=lambda array: array.tolist())
@@ -174,6 +209,7 @@ class WorldConfig:
             raise ValueError(f"world: unknown {sorted(unknown)}; there are: {sorted(known)}")
         parts = {
             "rod": lambda value: RodProperties(**value),
+            "board_spec": lambda value: BoardSpec(**value),
             "dual_arm": lambda value: DualArm(**value),
             "cameras": lambda value: tuple(CameraModel(**camera) for camera in value),
         }
@@ -190,6 +226,10 @@ class WorldConfig:
     def behind(self, left: str, right: str) -> "WorldConfig":
         """The same world behind other controllers."""
         return replace(self, controllers=(left, right))
+
+    def carrying(self, board: Gripper | None) -> "WorldConfig":
+        """The same world with the board in that gripper; with the rod in both for None."""
+        return replace(self, board=board)
 
     def moved_to(self, address: str, port: int) -> "WorldConfig":
         """The same world, served elsewhere."""

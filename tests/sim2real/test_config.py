@@ -18,7 +18,7 @@ def cell_file(tmp_path):
     return file
 
 
-@pytest.mark.parametrize("name", ["emulated", "ur5e"])
+@pytest.mark.parametrize("name", ["emulated", "uncalibrated", "ur5e"])
 def test_templates_are_valid(name):
     config = CellConfig.load(TEMPLATES / f"{name}.toml")
     assert set(config.arms) == {"left", "right"}

@@ -17,6 +17,7 @@ from sim2real.emulator import emulate
 from sim2real.emulator.emulated_cell import EmulatedCell
 from sim2real.emulator.rtde_reader import RtdeReader
 from sim2real.emulator.world_config import WorldConfig
+from sim2real.truth_source import TruthSource
 from tests.sim2real.fake_controller import free_address
 
 ARMS = DualArm()
@@ -85,10 +86,31 @@ def test_commands_reach_their_part(cell):
     assert "protective_stop" in emulate.run_command(cell, "help")
 
 
+def test_board_goes_from_gripper_to_gripper_with_both_arms_home(cell):
+    assert cell.truth().board is None
+    said = emulate.run_command(cell, "board right")
+    assert said == "board right: done, both arms are home"
+    truth = cell.truth()
+    assert truth.board == "right"
+    with pytest.raises(DeviceError, match="board none"):
+        TruthSource(f"{cell.world.url}/truth").newest()
+    np.testing.assert_allclose(truth.joint_angles, ARMS.home, atol=1e-4)
+    assert "board in the right gripper" in emulate.run_command(cell, "status")
+    emulate.run_command(cell, "board left")
+    assert cell.truth().board == "left"
+    emulate.run_command(cell, "board none")
+    assert cell.truth().board is None
+    assert len(cell.truth().centerline) == 51
+    cell.place(held_at(0.42))
+
+
 @pytest.mark.parametrize(
     "line",
     [
         "dance",
+        "board",
+        "board up",
+        "board left 3",
         "left",
         "left freeze soon",
         "left freeze 1 2",
@@ -191,6 +213,7 @@ def test_command_says_what_listens_takes_faults_and_quits():
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_command_with_a_world_stops_cleanly(number):
     options = ("--world", "--address", free_address(48), "--port", "0", "--clutter")
+    options += ("--board", "left")
     with command(*options, stdin=subprocess.DEVNULL) as process:
         said = read_until(process, "Ctrl-C stops")
         assert f"http://{free_address(48)}" in said
@@ -198,7 +221,9 @@ def test_command_with_a_world_stops_cleanly(number):
         assert process.poll() is None  # the end of input stops nothing
         process.send_signal(number)
         assert process.wait(10.0) == 0
-        assert "stopped" in process.stdout.read()
+        rest = process.stdout.read()
+        assert "stopped" in rest
+        assert "retrying" not in said + rest  # nothing was wrong
 
 
 def _runs(pid):

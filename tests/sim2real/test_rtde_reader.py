@@ -68,6 +68,20 @@ def test_comes_back_after_the_controller_was_away(address, reader):
         assert reader.connections == 2
 
 
+def test_only_an_absence_that_lasts_is_worth_a_warning(address, reader, caplog):
+    time.sleep(0.5)  # the reader was there first
+    for _ in range(2):
+        with FakeController(address, HOME):
+            wait_until(lambda: reader.connected)
+        wait_until(lambda: not reader.connected)
+    assert not caplog.records
+    wait_until(lambda: caplog.records)
+    time.sleep(0.5)
+    assert [record.message for record in caplog.records] == [
+        f"RTDE {address}:30004: [Errno 111] Connection refused; retrying"
+    ]
+
+
 def test_a_silent_stream_is_given_up_and_asked_for_anew(address, reader):
     with FakeController(address, HOME) as controller:
         wait_until(lambda: reader.connected)

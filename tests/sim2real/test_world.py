@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 
 from dlo_gym.exceptions import DeviceError
-from dlo_gym.geometry.se3 import exp_so3, pose
+from dlo_gym.geometry.se3 import exp_so3, inverse, log_so3, pose, transform_points
 from dlo_gym.rod.boundary import BoundaryPoses
 from dlo_gym.rod.properties import RodProperties
-from dlo_gym.scene.arms import T_CLAMP_TCP, DualArm
+from dlo_gym.scene.arms import SIDES, T_CLAMP_TCP, DualArm
 from dlo_gym.scene.builder import default_cameras
 from dlo_gym.scene.renderer import SceneRenderer
 from dlo_gym.scene.ur5e import link_frames
+from sim2real.calibration.board import BoardSpec
+from sim2real.calibration.plan import nominal_mount
 from sim2real.cameras.camera import CameraSettings
 from sim2real.cameras.mjpeg_camera import MjpegCamera
 from sim2real.config import TEMPLATES, CellConfig
@@ -29,6 +31,8 @@ from tests.sim2real.fake_controller import FakeController, free_address
 
 ARMS = DualArm()
 ROD = RodProperties(length=0.5)
+BOARD = BoardSpec()
+BIG_SQUARES = BoardSpec(4, 3, 0.06, 0.045)  # that the small pictures of these tests resolve
 
 
 def wait_until(condition, timeout=10.0):
@@ -122,6 +126,9 @@ def test_config_survives_its_json():
         latency={"top": 0.1},
         n_occluders=2,
         seed=3,
+        board="right",
+        board_spec=BoardSpec(5, 4, 0.05, 0.037),
+        T_tcp_board=pose(exp_so3([0.1, 0.2, 0.3]), [0.01, 0.02, 0.03]),
     )
     again = WorldConfig.from_json(config.to_json())
     assert again.to_json() == config.to_json()
@@ -144,6 +151,9 @@ def test_config_survives_its_json():
         ({"rod": {"length": -1}}, "length"),
         ({"rod": {"size": 1}}, "size"),
         ({"colour": "red"}, "colour"),
+        ({"board": "middle"}, "board: .*'middle'"),
+        ({"T_tcp_board": np.ones((4, 4)).tolist()}, "T_tcp_board"),
+        ({"board_spec": {"squares_x": 1}}, "squares_x"),
         ([], "object"),
     ],
 )
@@ -160,6 +170,22 @@ def test_config_of_a_cell_file():
     assert [camera.name for camera in config.cameras] == ["side", "top"]
     assert config.rod.length == cell.rod.length_m
     assert config.n_elements + 1 == cell.tracker.n_nodes
+
+
+def test_a_board_is_gripped_a_little_off_and_in_each_gripper_differently():
+    config = WorldConfig(board="left")
+    left, right = (inverse(nominal_mount(BOARD)) @ config.board_mount(side) for side in SIDES)
+    for off in (left, right):
+        assert 1e-4 < np.linalg.norm(off[:3, 3]) < 0.01
+        assert 1e-3 < np.linalg.norm(log_so3(off[:3, :3])) < 0.2
+    assert np.abs(left - right).max() > 1e-4
+    given = pose(np.eye(3), [0.0, 0.0, 0.05])
+    np.testing.assert_array_equal(WorldConfig(T_tcp_board=given).board_mount("left"), given)
+    plate = config.scene.boards[0]
+    assert (plate.side, plate.size) == ("left", BOARD.size_m)
+    assert config.scene.n_nodes == 0
+    assert config.carrying(None).scene.n_nodes == 51
+    assert config.carrying(None).scene.boards == ()
 
 
 class Arms:
@@ -193,7 +219,11 @@ def arms():
 @pytest.fixture(scope="module")
 def world(arms):
     config = WorldConfig(
-        controllers=arms.addresses, address=free_address(33), port=0, drawing_share=1.0
+        controllers=arms.addresses,
+        address=free_address(33),
+        port=0,
+        drawing_share=1.0,
+        board_spec=BIG_SQUARES,
     )
     with EmulatedWorld(config) as world:
         wait_until(lambda: all(c["connected"] for c in world.status()["controllers"].values()))
@@ -265,6 +295,35 @@ def test_overstretch_reaches_both_controllers(world, arms):
     assert "overstretched" in truth_when(world, lambda truth: truth.problem).problem
     arms.go(boundary(0.4))
     wait_until(lambda: abs(arms.fakes[0].wrench[0]) < 1.0)
+
+
+def test_a_board_takes_the_rods_place_and_gives_it_back(world, arms):
+    arms.go(boundary(0.4))
+    for index, side in enumerate(SIDES):
+        world.carry(side)
+        truth = truth_when(world, lambda truth, side=side: truth.board == side)
+        assert truth.centerline.shape == (0, 3)
+        assert {seen.shape for seen in truth.visible.values()} == {(0,)}
+        assert not truth.wrenches.any()
+        assert world.status()["board"] == side
+        wait_until(lambda: all(fake.wrench == [0.0] * 6 for fake in arms.fakes))
+        # The corners are seen where the mount and the arm's kinematics say.
+        clamp = (truth.boundary.left, truth.boundary.right)[index]
+        T_world_board = clamp @ T_CLAMP_TCP[index] @ world.config.board_mount(side)
+        camera = world.config.cameras[1]
+        picture = cv2.imdecode(np.frombuffer(world.picture(camera.name), np.uint8), 1)
+        found = BIG_SQUARES.detect(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+        assert len(found) == BIG_SQUARES.n_corners
+        expected = camera.project(transform_points(T_world_board, BIG_SQUARES.corners))
+        assert np.abs(found.corners - expected[found.ids]).max() < 0.5
+    world.carry(None)
+    truth = truth_when(world, lambda truth: truth.board is None)
+    np.testing.assert_allclose(
+        truth.centerline, HeldRod(ROD).follow(truth.boundary).positions, atol=2e-5
+    )
+    for wrong in ({}, {"side": "middle"}, {"side": []}, "left"):
+        with pytest.raises(ValueError, match="left"):
+            world._json("POST", "/board", wrong)
 
 
 def test_pictures_and_truth_share_stamps_of_the_angles_drawn(world, arms):

@@ -36,9 +36,10 @@ def loop(camera):
     return camera.centre + (flat - camera.centre) * away[:, None]
 
 
-def opened(config):
+def opened(config, positions=None):
     scene = SceneRenderer(config)
-    scene.update(*hanging())
+    hung, boundary = hanging()
+    scene.update(hung if positions is None else positions, boundary)
     try:
         scene.rod_mask(config.cameras[0].name)
     except RenderingUnavailable as error:
@@ -189,6 +190,20 @@ def test_a_rod_seen_at_a_grazing_angle_does_not_hide_itself(plain):
     positions = start + np.linspace(0.0, 0.5, N_NODES)[:, None] * direction
     plain.update(positions, hanging()[1])
     assert plain.visibility("side").all()
+
+
+def test_without_a_rod_none_is_drawn_and_none_is_seen(plain):
+    camera = plain.config.cameras[0].name
+    with opened(replace(plain.config, n_nodes=0), np.zeros((0, 3))) as bare:
+        assert not bare.rod_mask(camera).any()
+        assert bare.visibility(camera).shape == (0,)
+        plain.update(*hanging())
+        with_rod, mask = plain.render(camera).image, plain.rod_mask(camera)
+        changed = (bare.render(camera).image != with_rod).any(axis=-1)
+        assert changed[mask].all()
+        assert not changed[~mask].any()
+        with pytest.raises(ValueError, match=r"\(0, 3\)"):
+            bare.update(*hanging())
 
 
 def test_nodes_outside_the_image_are_not_seen(plain):
