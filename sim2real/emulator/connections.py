@@ -1,31 +1,16 @@
 """What the emulator's servers share: a listener on a loopback address with a bounded crowd."""
 
 import asyncio
-import ipaddress
 import logging
 from collections.abc import Callable
+
+from sim2real.emulator.loopback import check_loopback
 
 _log = logging.getLogger(__name__)
 
 MAX_CONNECTIONS = 32  # on one port
 LARGEST_BACKLOG = 1 << 20  # bytes a client may leave unread before it is dropped
 LONGEST_LINE = 1 << 16
-
-
-def check_loopback(address: str) -> str:
-    """``address`` again.
-
-    Raises:
-        ValueError: if it is not an IPv4 address in 127.0.0.0/8; the emulator has no
-            authentication and drives nothing real, it does not belong on a network.
-    """
-    try:
-        inside = ipaddress.IPv4Address(address) in ipaddress.IPv4Network("127.0.0.0/8")
-    except ipaddress.AddressValueError:
-        inside = False
-    if not inside:
-        raise ValueError(f"address: expected an IPv4 address in 127.0.0.0/8, got {address!r}")
-    return address
 
 
 class Listener:

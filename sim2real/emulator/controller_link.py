@@ -8,14 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from dlo_gym.exceptions import DeviceError
 from dlo_gym.geometry.se3 import Array
+from sim2real.emulator.loopback import CONTROL_PORT, LARGEST_REPLY, json_object
 from sim2real.emulator.rtde_reader import JointSample, RtdeReader
 
-CONTROL_PORT = 63999
 SILENT = 0.1  # RTDE's silence after which the control port is asked where the arm is [s]
 _RETRY = 0.5
-_LARGEST_REPLY = 1 << 16
 
 _log = logging.getLogger(__name__)
 
@@ -97,29 +95,6 @@ class ControllerLink:
         self._control.close()
 
 
-def ask(
-    address: str, value: dict[str, Any], *, port: int = CONTROL_PORT, timeout: float = 2.0
-) -> dict[str, Any]:
-    """Asks an emulated controller's control port and waits for the answer.
-
-    Raises:
-        ValueError: if the controller refuses what it was asked.
-        DeviceError: if it does not answer within ``timeout`` [s].
-    """
-    try:
-        with socket.create_connection((address, port), timeout) as connection:
-            connection.sendall(json.dumps(value).encode() + b"\n")
-            line = connection.makefile("rb").readline(_LARGEST_REPLY)
-    except OSError as error:
-        raise DeviceError(f"the emulated controller at {address}: {error}") from error
-    answer = _object(line)
-    if answer is None:
-        raise DeviceError(f"the emulated controller at {address} closed its control port")
-    if "error" in answer:
-        raise ValueError(f"the emulated controller at {address}: {answer['error']}")
-    return answer
-
-
 class _JsonLines:
     """A connection that sends and takes JSON objects, a line each, without ever waiting."""
 
@@ -152,9 +127,9 @@ class _JsonLines:
         if self._socket is None:
             return []
         try:
-            while chunk := self._socket.recv(_LARGEST_REPLY):
+            while chunk := self._socket.recv(LARGEST_REPLY):
                 self._received += chunk
-                if len(self._received) > 16 * _LARGEST_REPLY:
+                if len(self._received) > 16 * LARGEST_REPLY:
                     raise ConnectionError("endless reply")
             raise ConnectionError("the controller closed its control port")
         except BlockingIOError:
@@ -162,7 +137,7 @@ class _JsonLines:
         except OSError as error:
             self._lose(error)
         *lines, self._received = self._received.split(b"\n")
-        return [reply for line in lines if (reply := _object(line)) is not None]
+        return [reply for line in lines if (reply := json_object(line)) is not None]
 
     def close(self) -> None:
         if self._socket is not None:
@@ -184,11 +159,3 @@ class _JsonLines:
         _log.info("control port %s:%d: %s", *self._where, error)
         self.close()
         self._retry_at = time.monotonic() + _RETRY
-
-
-def _object(line: bytes) -> dict[str, Any] | None:
-    try:
-        value = json.loads(line)
-    except ValueError:
-        return None
-    return value if isinstance(value, dict) else None

@@ -15,8 +15,8 @@ from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryPoses
 from dlo_gym.scene.arms import SIDES
 from sim2real.config import CellConfig
-from sim2real.emulator.controller_link import ask
 from sim2real.emulator.emulated_world import EmulatedWorld
+from sim2real.emulator.loopback import ask
 from sim2real.emulator.process import EmulatedController
 from sim2real.emulator.rtde_reader import PORT as RTDE_PORT
 from sim2real.emulator.truth import WorldTruth

@@ -31,8 +31,8 @@ import numpy as np
 
 from sim2real.emulator.connections import LineConnection, Listener
 from sim2real.emulator.controller import Controller
+from sim2real.emulator.loopback import CONTROL_PORT
 
-CONTROL_PORT = 63999
 LONGEST_FAULT = 3600.0  # s
 
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 from urllib.parse import parse_qsl
 
 from sim2real.emulator.camera_feed import CameraFeed, Picture
-from sim2real.emulator.world_config import check_loopback
+from sim2real.emulator.loopback import check_loopback
 
 BOUNDARY = "frame"
 MOST_CONNECTIONS = 32

@@ -8,12 +8,10 @@ hold the interpreter's lock while they wait for the robot.
 import argparse
 import asyncio
 import gc
-import json
 import logging
 import math
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -25,12 +23,12 @@ import numpy as np
 
 from dlo_gym.exceptions import DeviceError
 from sim2real.emulator import kinematics
-from sim2real.emulator.connections import check_loopback
 from sim2real.emulator.controller import Controller, ControllerOptions
 from sim2real.emulator.dashboard import DashboardServer
-from sim2real.emulator.faults import CONTROL_PORT, FaultServer
+from sim2real.emulator.faults import FaultServer
 from sim2real.emulator.gripper_server import GripperServer
 from sim2real.emulator.kinematics import Array
+from sim2real.emulator.loopback import ask, check_loopback
 from sim2real.emulator.motion import TICK, Motion, MotionFault, MotionLimits
 from sim2real.emulator.rtde_server import RtdeServer
 from sim2real.emulator.script_server import ScriptServer
@@ -266,18 +264,7 @@ class EmulatedController:
             ValueError: if the emulator refuses it.
             DeviceError: if it does not answer within 5 s.
         """
-        try:
-            with socket.create_connection((self.address, CONTROL_PORT), 5.0) as link:
-                link.sendall(json.dumps(request).encode() + b"\n")
-                line = link.makefile("rb").readline()
-        except OSError as error:
-            raise DeviceError(f"the emulated controller at {self.address}: {error}") from error
-        if not line:
-            raise DeviceError(f"the emulated controller at {self.address} closed its control port")
-        reply = json.loads(line)
-        if "error" in reply:
-            raise ValueError(f"the emulated controller at {self.address}: {reply['error']}")
-        return reply
+        return ask(self.address, request, timeout=5.0)
 
     def _listens(self) -> bool:
         """Whether this process answers, not another one that has the address."""

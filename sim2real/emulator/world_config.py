@@ -1,6 +1,5 @@
 """What the simulated world behind two emulated controllers is made of."""
 
-import ipaddress
 import json
 import os
 from collections.abc import Mapping
@@ -20,6 +19,7 @@ from dlo_gym.scene.builder import SceneConfig, default_cameras
 from sim2real.calibration.board import BoardSpec
 from sim2real.calibration.plan import nominal_mount
 from sim2real.config import CellConfig
+from sim2real.emulator.loopback import check_loopback, is_loopback
 
 Gripper = Literal["left", "right"]  # that carries the board, where one is carried
 
@@ -166,7 +166,7 @@ class WorldConfig:
         """
         for camera in cell.cameras.values():
             where = urlsplit(str(camera.device))
-            if where.scheme == "http" and _is_loopback(where.hostname or ""):
+            if where.scheme == "http" and is_loopback(where.hostname or ""):
                 options = {"address": where.hostname, "port": where.port or 80} | options
                 break
         left, right = (cell.arms[side].address for side in SIDES)  # type: ignore[index]
@@ -236,17 +236,6 @@ class WorldConfig:
         return replace(self, address=address, port=port)
 
 
-def check_loopback(address: str, name: str) -> str:
-    """``address``, after checking that only this machine can reach it.
-
-    Raises:
-        ValueError: if it is no IPv4 address in 127.0.0.0/8.
-    """
-    if not _is_loopback(address):
-        raise ValueError(f"{name}: expected an address in 127.0.0.0/8, got {address!r}")
-    return address
-
-
 def check_seconds(value: Any, name: str, largest: float = LARGEST_LATENCY) -> float:
     """``value`` as a duration from 0 to ``largest`` [s].
 
@@ -261,10 +250,3 @@ def check_seconds(value: Any, name: str, largest: float = LARGEST_LATENCY) -> fl
 
 def _n_cores() -> int:
     return len(os.sched_getaffinity(0))
-
-
-def _is_loopback(address: str) -> bool:
-    try:
-        return ipaddress.IPv4Address(address).is_loopback
-    except ValueError:
-        return False
