@@ -10,6 +10,8 @@ from dlo_gym.geometry.curves import parallel_transport
 from dlo_gym.geometry.se3 import Array, exp_so3, log_so3, matrix_to_quaternion
 from dlo_gym.rod import _kernels_energy as energy_kernels
 from dlo_gym.rod import _kernels_solve as kernels
+from dlo_gym.rod._kernels_assembly import System
+from dlo_gym.rod._kernels_inertia import NO_INERTIA
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.initial_shapes import hanging
 from dlo_gym.rod.properties import RodProperties, per_element
@@ -63,20 +65,26 @@ class CosseratRod:
         if self.gravity.shape != (3,) or not np.isfinite(self.gravity).all():
             raise ValueError(f"gravity: expected three finite numbers [m/s^2], got {gravity}")
         self._arrays = _arrays(properties, n_elements, self.gravity, clamp)
+        self._system = System(self._arrays, NO_INERTIA)
         stiffness = float(self._arrays.bending[:, 0].mean())
         weight = float(np.abs(self._arrays.forces).sum())
         # Differences of coordinates of about 1 m carry this much of rounding error in force.
         element_stiffness = self._arrays.shear[:, 2].max() * n_elements / properties.length
         rounding = 8.0 * np.finfo(np.float64).eps * element_stiffness
-        self._force_scale = stiffness / properties.length**2 + weight + rounding / TOLERANCE
-        self._torque_scale = stiffness / properties.length + weight * properties.length / n_elements
+        self._limits = kernels.Limits(
+            residual=TOLERANCE,
+            force=stiffness / properties.length**2 + weight + rounding / TOLERANCE,
+            torque=stiffness / properties.length + weight * properties.length / n_elements,
+        )
         softest = self._arrays.shear[:, 2].min()
         self._largest_strain = LARGEST_STRAIN + 3.0 * weight / softest
         n_dofs = 6 * n_elements + 3
-        self._gradient = np.zeros(n_dofs)
-        self._band = np.zeros((n_dofs, 9))
-        self._stress = np.zeros((n_elements, 3))
-        self._clamp_terms = np.zeros((2, 4, 3))
+        self._work = energy_kernels.Work(
+            stress=np.zeros((n_elements, 3)),
+            gradient=np.zeros(n_dofs),
+            band=np.zeros((n_dofs, 9)),
+            clamp_terms=np.zeros((2, 4, 3)),
+        )
         self._boundary: BoundaryPoses | None = None
 
     @property
@@ -96,6 +104,7 @@ class CosseratRod:
             )
         weight = _weight(self.properties, self.n_elements, self.gravity)
         self._arrays = self._arrays._replace(forces=weight + forces)
+        self._system = self._system._replace(rod=self._arrays)
 
     def settle(self, boundary: BoundaryPoses, start: ArrayLike | None = None) -> RodState:
         """Find the equilibrium between clamps from afar.
@@ -219,10 +228,8 @@ class CosseratRod:
         """
         if self._boundary is None:
             raise ValueError("sensitivity: the rod has no state yet; call settle(boundary) first")
-        columns = np.empty((len(self._gradient), 12))
-        kernels.sensitivity(
-            self._band, self._clamp_terms, self._rotations, self._right_held, columns
-        )
+        columns = np.empty((len(self._work.gradient), 12))
+        kernels.sensitivity(self._work, self._rotations, self._ends.right_held, columns)
         positions = np.arange(self.n_nodes)[:, None] * 6 + np.arange(3)
         return columns[positions]
 
@@ -239,24 +246,21 @@ class CosseratRod:
 
     def _set_clamps(self, boundary: BoundaryPoses) -> None:
         self._boundary = boundary
-        self._right_held = boundary.right is not None
         right = boundary.left if boundary.right is None else boundary.right
         self._rotations = np.stack([boundary.left[:3, :3], right[:3, :3]])
-        self._clamps = matrix_to_quaternion(self._rotations)
+        frames = matrix_to_quaternion(self._rotations)
+        self._ends = energy_kernels.Ends(frames, boundary.right is not None)
 
     def _linearise(self) -> int:
         self._energy, negative = kernels.linearise(
-            self._arrays, self._x, self._q, self._clamps, self._right_held,
-            self._stress, self._gradient, self._band, self._clamp_terms,
+            self._system, self._x, self._q, self._ends, self._work
         )  # fmt: skip
         return negative
 
     def _minimise(self) -> str:
         """Settle from the present shape; returns what is wrong with the result, or ""."""
         status, steps = kernels.minimise(
-            self._arrays, self._x, self._q, self._clamps, self._right_held,
-            TOLERANCE, self._force_scale, self._torque_scale, 2000,
-            self._stress, self._gradient, self._band, self._clamp_terms,
+            self._system, self._x, self._q, self._ends, self._limits, 2000, self._work
         )  # fmt: skip
         self._linearise()
         if status != kernels.CONVERGED:
@@ -273,14 +277,13 @@ class CosseratRod:
         full_twist = np.zeros(12)
         full_twist[: len(twist)] = twist
         status, energy_after = kernels.follow(
-            self._arrays, self._x, self._q, self._clamps, self._right_held, full_twist, rotations,
-            TOLERANCE, self._force_scale, self._torque_scale,
-            self._stress, self._gradient, self._band, self._clamp_terms,
+            self._system, self._x, self._q, self._ends, full_twist, rotations, self._limits,
+            self._work,
         )  # fmt: skip
         if status == kernels.CONVERGED:
             # The clamps' work bounds the energy's rise; more means another branch was reached.
             work = 0.5 * full_twist @ (wrenches + self._wrenches()).ravel()
-            slack = abs(work) + 1e-3 * self._torque_scale
+            slack = abs(work) + 1e-3 * self._limits.torque
             if energy_after - energy <= work + slack and not self._implausible():
                 self._energy = energy_after
                 return True
@@ -320,11 +323,11 @@ class CosseratRod:
     def _wrenches(self) -> Array:
         """(2, 6) force and torque of the clamps on the rod, world axes."""
         wrenches = np.zeros((2, 6))
-        wrenches[0, :3] = self._gradient[:3]
-        wrenches[0, 3:] = self._rotations[0] @ self._clamp_terms[0, 0]
-        if self._right_held:
-            wrenches[1, :3] = self._gradient[-3:]
-            wrenches[1, 3:] = self._rotations[1] @ self._clamp_terms[1, 0]
+        wrenches[0, :3] = self._work.gradient[:3]
+        wrenches[0, 3:] = self._rotations[0] @ self._work.clamp_terms[0, 0]
+        if self._ends.right_held:
+            wrenches[1, :3] = self._work.gradient[-3:]
+            wrenches[1, 3:] = self._rotations[1] @ self._work.clamp_terms[1, 0]
         return wrenches
 
 
@@ -350,6 +353,7 @@ def _arrays(
     return energy_kernels.RodArrays(
         rest_length,
         np.ascontiguousarray(shear),
+        np.zeros((n, 3)),
         np.concatenate([elements[:1], between, elements[-1:]]),
         np.concatenate([rest[:1], rest, rest[-1:]]),
         voronoi,
