@@ -28,6 +28,6 @@ def assemble(system, x, q, ends, work, with_hessian):
     The band is written ``with_hessian`` only.
     """
     energy = assemble_rod(system.rod, x, q, ends, work, with_hessian)
-    if system.inertia.node_weight.size > 0:
+    if system.inertia.weight.size > 0:
         energy += add_inertia(system.inertia, x, q, work, with_hessian)
     return energy

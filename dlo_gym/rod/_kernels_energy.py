@@ -122,7 +122,7 @@ def rotate(q, vx, vy, vz):
 
 
 @njit(cache=True)
-def _log_factor(w):
+def log_factor(w):
     """g, g' and g'' for the rotation vector g(w) v of a unit quaternion (w, v), w >= 0."""
     z = 0.5 * (1.0 - w)
     if z < 0.02:
@@ -157,7 +157,7 @@ def _bending(q, B, rest, D, grad_a, grad_b, H_aa, H_bb, H_ab, with_hessian):
     ``q`` (4,) is the relative quaternion; a and b act as exp(-a/2) q exp(b/2).
     """
     w, v0, v1, v2 = q[0], q[1], q[2], q[3]
-    g, dg, ddg = _log_factor(w)
+    g, dg, ddg = log_factor(w)
     v = (v0, v1, v2)
     m0 = B[0] * (g * v0 / D - rest[0])
     m1 = B[1] * (g * v1 / D - rest[1])
@@ -222,8 +222,8 @@ def _bending(q, B, rest, D, grad_a, grad_b, H_aa, H_bb, H_ab, with_hessian):
 
 
 @njit(cache=True)
-def strains(rod, x, q, gamma, kappa):
-    """Update ``gamma`` (n, 3) and ``kappa`` (n - 1, 3) given nodes x and frames q."""
+def strains(rod, x, q, ends, gamma, kappa):
+    """Update ``gamma`` (n, 3) and ``kappa`` (n + 1, 3) given nodes x and frames q."""
     n = q.shape[0]
     R = np.empty((3, 3))
     relative = np.empty(4)
@@ -235,11 +235,13 @@ def strains(rod, x, q, gamma, kappa):
                 p += R[k, i] * (x[e + 1, k] - x[e, k])
             gamma[e, i] = p / rod.rest_length[e]
         gamma[e, 2] -= 1.0
-        if e > 0:
-            relative_quaternion(q[e - 1], q[e], relative)
-            g, _, _ = _log_factor(relative[0])
-            for i in range(3):
-                kappa[e - 1, i] = g * relative[i + 1] / rod.voronoi_length[e]
+    kappa[n] = 0.0
+    for i in range(n + 1 if ends.right_held else n):
+        before = ends.frames[0] if i == 0 else q[i - 1]
+        relative_quaternion(before, ends.frames[1] if i == n else q[i], relative)
+        g, _, _ = log_factor(relative[0])
+        for k in range(3):
+            kappa[i, k] = g * relative[k + 1] / rod.voronoi_length[i]
 
 
 @njit(cache=True)

@@ -20,20 +20,18 @@ from dlo_gym.rod._kernels_energy import quaternion_to_columns
 class Inertia(NamedTuple):
     """Springs to where nodes and directors would go unaccelerated; empty arrays for equilibria.
 
+    Rows are those of "places": the n + 1 nodes, then d1 and d2 of every element in turn.
+
     Attributes:
-        node_weight: (n + 1,) m / s^2 [N/m].
-        node_centre: (n + 1, 3) x^ [m].
-        spin_weight: (n,) J / s^2 [N m].
-        spin_centre: (n, 2, 3) d1^ and d2^ [-].
+        weight: (3 n + 1,) m / s^2 [N/m], J / s^2 [N m].
+        centre: (3 n + 1, 3) x^ [m], d1^ and d2^ [-].
     """
 
-    node_weight: np.ndarray
-    node_centre: np.ndarray
-    spin_weight: np.ndarray
-    spin_centre: np.ndarray
+    weight: np.ndarray
+    centre: np.ndarray
 
 
-NO_INERTIA = Inertia(np.zeros(0), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2, 3)))
+NO_INERTIA = Inertia(np.zeros(0), np.zeros((0, 3)))
 
 
 @njit(cache=True)
@@ -42,9 +40,9 @@ def add_inertia(inertia, x, q, work, with_hessian):
     gradient, band = work.gradient, work.band
     energy = 0.0
     for i in range(x.shape[0]):
-        weight = inertia.node_weight[i]
+        weight = inertia.weight[i]
         for k in range(3):
-            offset = x[i, k] - inertia.node_centre[i, k]
+            offset = x[i, k] - inertia.centre[i, k]
             energy += 0.5 * weight * offset * offset
             gradient[6 * i + k] += weight * offset
             if with_hessian:
@@ -52,14 +50,17 @@ def add_inertia(inertia, x, q, work, with_hessian):
     R = np.empty((3, 3))
     Q = np.empty((3, 2))
     for e in range(q.shape[0]):
-        weight = inertia.spin_weight[e]
-        centre = inertia.spin_centre[e]
+        row = x.shape[0] + 2 * e
+        weight = inertia.weight[row]
         quaternion_to_columns(q[e], R)
         for j in range(2):
+            c = inertia.centre[row + j]
+            c0, c1, c2 = c[0], c[1], c[2]
+            energy += (
+                0.5 * weight * ((R[0, j] - c0) ** 2 + (R[1, j] - c1) ** 2 + (R[2, j] - c2) ** 2)
+            )
             for k in range(3):
-                offset = R[k, j] - centre[j, k]
-                energy += 0.5 * weight * offset * offset
-                Q[k, j] = R[0, k] * centre[j, 0] + R[1, k] * centre[j, 1] + R[2, k] * centre[j, 2]
+                Q[k, j] = R[0, k] * c0 + R[1, k] * c1 + R[2, k] * c2
         theta = 6 * e + 3
         gradient[theta] -= weight * Q[2, 1]
         gradient[theta + 1] += weight * Q[2, 0]

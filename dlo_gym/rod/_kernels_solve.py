@@ -113,8 +113,10 @@ def _residual(gradient, first, last, limits):
 
 @njit(cache=True)
 def linearise(system, x, q, ends, work):
-    """Factorise the Hessian at a solution; returns (potential, number of negative pivots)."""
-    exact_stress(system.rod, x, q, work.stress)
+    """Factorise the Hessian, with ``work``'s stress, at a solution.
+
+    Returns (potential, number of negative pivots).
+    """
     energy = assemble(system, x, q, ends, work, True)
     first, last = free_range(q.shape[0], ends.right_held)
     return energy, factorise(work.band, first, last)
@@ -192,11 +194,10 @@ def follow(system, x, q, ends, twist, clamp_rotations, limits, work):
         if not turn < LARGEST_TURN:
             return STALLED, 0.0
         apply_step(system.rod, x, q, step[:, 0], 1.0, work.stress)
-        assemble(system, x, q, ends, work, True)
+        energy = assemble(system, x, q, ends, work, True)
+        negative = factorise(band, first, last)
         if _residual(gradient, first, last, limits) < limits.residual:
-            energy, negative = linearise(system, x, q, ends, work)
             return (UNSTABLE if negative else CONVERGED), energy
-        factorise(band, first, last)
         step[:, 0] = 0.0
         for j in range(first, last):
             step[j, 0] = -gradient[j]
