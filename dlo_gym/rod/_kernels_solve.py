@@ -7,7 +7,13 @@ import numpy as np
 from numba import njit
 
 from dlo_gym.rod._kernels_assembly import assemble
-from dlo_gym.rod._kernels_banded import factorise, multiply_coupling, shift_diagonal, solve
+from dlo_gym.rod._kernels_banded import (
+    factorise,
+    multiply_coupling,
+    shift_diagonal,
+    solve,
+    solve_one,
+)
 from dlo_gym.rod._kernels_energy import rotate
 
 CONVERGED, STALLED, UNSTABLE = 0, 1, 2
@@ -185,7 +191,7 @@ def follow(system, x, q, ends, twist, clamp_rotations, limits, work):
             for i in range(3):
                 step[theta + i, 0] -= clamp_terms[side, 1 + i, k] * turn
     for count in range(NEWTON_STEPS):
-        solve(band, first, last, step)
+        solve_one(band, first, last, step[:, 0])
         if count == 0:
             for j in range(n_dofs):
                 if j < first or j >= last:
@@ -242,7 +248,7 @@ def minimise(system, x, q, ends, limits, max_steps, work):
                 step[j, 0] = -gradient[j]
                 if residual < tolerance:  # a saddle: leave it in a fixed, generic direction
                     step[j, 0] = 1e-3 * limits.torque * np.cos(1.0 + 0.7 * j)
-            solve(band, first, last, step)
+            solve_one(band, first, last, step[:, 0])
             turn = _largest_turn(step[:, 0], n)
             scale = min(1.0, 0.5 * LARGEST_TURN / max(turn, 1e-300))
             x_trial[:] = x
