@@ -1,7 +1,8 @@
 """Drawing primitives into an image with a depth buffer, by a ray through each pixel.
 
-A primitive's rays are cast only inside the outline of its bounding box, row by row; within a row
-the ray's direction is linear in the column.
+A primitive's rays are cast only inside the outline of its bounding box, row by row. The light is
+directional, and so is the look for the highlights, so that a face has one colour and a cylinder one
+per line along its axis.
 """
 
 from typing import NamedTuple
@@ -10,8 +11,11 @@ import numpy as np
 from numba import njit
 
 from dlo_gym.geometry.se3 import Array
-from dlo_gym.scene._kernels_rays import _FAST, CAPSULE, CYLINDER, PLANE, meet, normal
+from dlo_gym.scene._kernels_rays import _FAST, BOX, CAPSULE, CYLINDER, PLANE, meet, normal
 
+TINTS = 64  # colours from one rim of a cylinder to the other
+SAMPLES = 4  # of a texture, across and down each pixel
+GLOSSY = 0.85  # cosine between normal and highlight from which it counts
 NEAREST = 0.02  # what comes closer to a camera has no outline: the whole image is searched [m]
 
 
@@ -45,39 +49,64 @@ def draw(image, nearness, pinhole, primitives, lights):
     """Update ``image`` (h, w, 3) and ``nearness`` (h, w) [1/m] where a primitive is nearer."""
     height = len(image)
     left, right = np.empty(height), np.empty(height)
+    R_body_camera, rays = np.empty((3, 3)), np.empty((3, 3))
+    origin, offset = np.empty(3), np.empty(3)
+    towards, halfway = np.empty_like(lights.towards), np.empty_like(lights.halfway)
+    tints = np.empty((TINTS + 1, 3), np.uint8)
     for i in range(len(primitives.kinds)):
-        rotation, size = primitives.rotations[i], primitives.sizes[i]
-        # p_body = origin + depth (directions @ (u, v, 1))
-        origin = rotation.T @ (pinhole.centre - primitives.positions[i])
-        R_body_camera = rotation.T @ pinhole.R_world_camera
-        first, last = outline(
-            left, right, primitives.kinds[i], size, R_body_camera, origin, pinhole.K, image.shape
+        kind, size = primitives.kinds[i], primitives.sizes[i]
+        rotation, position = primitives.rotations[i], primitives.positions[i]
+        for k in range(3):
+            offset[k] = pinhole.centre[k] - position[k]
+        _into_body(origin, rotation, offset)
+        for k in range(3):
+            _into_body(R_body_camera[:, k], rotation, pinhole.R_world_camera[:, k])
+        first, last, clipped = outline(
+            left, right, kind, size, R_body_camera, origin, pinhole.K, image.shape
         )
-        if first <= last:
-            _fill(
-                image, nearness, first, last, left, right, primitives.kinds[i], size, origin,
-                _pixel_directions(R_body_camera, pinhole.K), primitives.paints[i],
-                lights, lights.towards @ rotation, lights.halfway @ rotation,
-            )  # fmt: skip
+        if first > last:
+            continue
+        _pixel_rays(rays, R_body_camera, pinhole.K)
+        for k in range(len(towards)):
+            _into_body(towards[k], rotation, lights.towards[k])
+            _into_body(halfway[k], rotation, lights.halfway[k])
+        lit = Lights(towards, halfway, lights.diffuse, lights.specular, lights.ambient)
+        spans = (first, last, left, right)
+        paint = primitives.paints[i]
+        hidden_axis = origin[0] ** 2 + origin[1] ** 2 > size[0] ** 2
+        if kind == BOX and not clipped:
+            _tint_box(tints, paint, lit, origin)
+            _fill_box(image, nearness, spans, size, origin, rays, tints)
+        elif kind == CYLINDER and hidden_axis:
+            _tint_cylinder(tints, paint, lit, origin)
+            _fill_cylinder(image, nearness, spans, size, origin, rays, tints)
+        else:
+            _fill(image, nearness, spans, kind, size, origin, rays, paint, lit)
 
 
 @njit(cache=True)
-def _pixel_directions(R_body_camera, K):
-    """(3, 3) that takes a pixel (u, v, 1) to its ray in the body's frame, of depth 1."""
-    directions = np.empty((3, 3))
-    directions[:, 0] = R_body_camera[:, 0] / K[0, 0]
-    directions[:, 1] = R_body_camera[:, 1] / K[1, 1]
-    directions[:, 2] = (
-        R_body_camera[:, 2] - K[0, 2] * directions[:, 0] - K[1, 2] * directions[:, 1]
-    )
-    return directions
+def _into_body(out, rotation, vector):
+    """Update ``out`` (3,) to a world vector in the frame of a body with ``R_world_body``."""
+    for k in range(3):
+        out[k] = (
+            rotation[0, k] * vector[0] + rotation[1, k] * vector[1] + rotation[2, k] * vector[2]
+        )
+
+
+@njit(cache=True)
+def _pixel_rays(rays, R_body_camera, K):
+    """Update ``rays`` (3, 3): times a pixel (u, v, 1) they are its ray, of depth 1, in the body."""
+    for k in range(3):
+        rays[k, 0] = R_body_camera[k, 0] / K[0, 0]
+        rays[k, 1] = R_body_camera[k, 1] / K[1, 1]
+        rays[k, 2] = R_body_camera[k, 2] - K[0, 2] * rays[k, 0] - K[1, 2] * rays[k, 1]
 
 
 @njit(cache=True, error_model="numpy")
 def outline(left, right, kind, size, R_body_camera, origin, K, shape):
     """Update ``left`` and ``right`` (h,), per row the columns between which a primitive may lie.
 
-    Returns the first and the last row.
+    Returns the first and the last row, and whether it comes too close for an outline.
     """
     height, width = shape[0], shape[1]
     hx, hy, hz = size
@@ -102,11 +131,11 @@ def outline(left, right, kind, size, R_body_camera, origin, K, shape):
             corners[i, k] = K[k, k] * across / depth + K[k, 2]
     if clipped:
         left[:], right[:] = 0.0, width - 1.0
-        return 0, height - 1
+        return 0, height - 1, True
     first = max(0, int(np.ceil(max(corners[:, 1].min(), 0.0))))
     last = min(height - 1, int(np.floor(min(corners[:, 1].max(), height - 1.0))))
     if first > last or corners[:, 0].max() < 0.0 or corners[:, 0].min() > width - 1.0:
-        return 0, -1
+        return 0, -1, False
     left[first : last + 1], right[first : last + 1] = np.inf, -np.inf
     for i in range(8):
         for bit in (1, 2, 4):
@@ -114,7 +143,7 @@ def outline(left, right, kind, size, R_body_camera, origin, K, shape):
                 _widen(left, right, first, last, corners[i], corners[i | bit])
     for v in range(first, last + 1):
         left[v], right[v] = max(left[v], 0.0), min(right[v], width - 1.0)
-    return first, last
+    return first, last, False
 
 
 @njit(cache=True, error_model="numpy")
@@ -131,15 +160,15 @@ def _widen(left, right, first, last, start, end):
 
 
 @njit(cache=True, fastmath=_FAST, error_model="numpy")
-def _fill(
-    image, nearness, first, last, left, right, kind, size, origin, directions, paint, lights,
-    towards, halfway,
-):  # fmt: skip
-    """Update ``image`` and ``nearness`` inside an outline with one primitive."""
-    ox, oy, oz = origin
-    gx, gy, gz = directions[:, 0]
+def _fill(image, nearness, spans, kind, size, origin, rays, paint, lights):
+    """Update ``image`` and ``nearness`` inside an outline with one primitive of any kind."""
+    first, last, left, right = spans
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    gx, gy, gz = rays[0, 0], rays[1, 0], rays[2, 0]
     for v in range(first, last + 1):
-        ex, ey, ez = directions[:, 1] * v + directions[:, 2]
+        ex = rays[0, 1] * v + rays[0, 2]
+        ey = rays[1, 1] * v + rays[1, 2]
+        ez = rays[2, 1] * v + rays[2, 2]
         for u in range(int(np.ceil(left[v])), int(np.floor(right[v])) + 1):
             dx, dy, dz = ex + gx * u, ey + gy * u, ez + gz * u
             near = meet(kind, size, ox, oy, oz, dx, dy, dz)
@@ -147,29 +176,115 @@ def _fill(
                 continue
             nearness[v, u] = near
             depth = 1.0 / near
-            x, y, z = ox + dx * depth, oy + dy * depth, oz + dz * depth
-            nx, ny, nz = normal(kind, size, x, y, z)
-            _shade(image[v, u], paint, nx, ny, nz, lights, towards, halfway)
+            nx, ny, nz = normal(kind, size, ox + dx * depth, oy + dy * depth, oz + dz * depth)
+            _shade(image[v, u], paint, lights, nx, ny, nz)
 
 
 @njit(cache=True, fastmath=_FAST, error_model="numpy")
-def _shade(pixel, paint, nx, ny, nz, lights, towards, halfway):
-    """Update ``pixel`` (3,) to a surface's colour: Lambert's and Blinn's reflection."""
-    r, g, b = lights.ambient
+def _fill_box(image, nearness, spans, size, origin, rays, tints):
+    """Update ``image`` and ``nearness`` inside the exact outline of a box, given ``_tint_box``."""
+    first, last, left, right = spans
+    start, step = np.empty(3), np.empty(3)
+    for v in range(first, last + 1):
+        # The nearness of a face's plane is linear in the pixel; the box begins at the farthest.
+        for k in range(3):
+            start[k], step[k] = np.inf, 0.0
+            if abs(origin[k]) > size[k]:
+                apart = np.copysign(size[k], origin[k]) - origin[k]
+                start[k] = (rays[k, 1] * v + rays[k, 2]) / apart
+                step[k] = rays[k, 0] / apart
+        start_x, start_y, start_z = start[0], start[1], start[2]
+        step_x, step_y, step_z = step[0], step[1], step[2]
+        for u in range(int(np.ceil(left[v])), int(np.floor(right[v])) + 1):
+            near_x, near_y, near_z = start_x + step_x * u, start_y + step_y * u, start_z + step_z * u
+            near = min(near_x, near_y, near_z)
+            if near <= nearness[v, u]:
+                continue
+            nearness[v, u] = near
+            face = 0 if near == near_x else (1 if near == near_y else 2)
+            for k in range(3):
+                image[v, u, k] = tints[face, k]
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _fill_cylinder(image, nearness, spans, size, origin, rays, tints):
+    """Update ``image`` and ``nearness`` inside an outline with a cylinder seen from beside its
+    axis, given ``_tint_cylinder``; the equations are ``meet``'s."""
+    first, last, left, right = spans
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    gx, gy, gz = rays[0, 0], rays[1, 0], rays[2, 0]
+    radius_2 = size[0] * size[0]
+    per_c = 1.0 / (ox * ox + oy * oy - radius_2)
+    per_upper, per_lower = 1.0 / (size[1] - oz), 1.0 / (-size[1] - oz)
+    above_cap = abs(oz) > size[1]
+    tint_scale = 0.5 * TINTS / (size[0] * np.sqrt(ox * ox + oy * oy))
+    for v in range(first, last + 1):
+        ex = rays[0, 1] * v + rays[0, 2]
+        ey = rays[1, 1] * v + rays[1, 2]
+        ez = rays[2, 1] * v + rays[2, 2]
+        for u in range(int(np.ceil(left[v])), int(np.floor(right[v])) + 1):
+            dx, dy, dz = ex + gx * u, ey + gy * u, ez + gz * u
+            beside = ox * dy - oy * dx
+            discriminant = radius_2 * (dx * dx + dy * dy) - beside * beside
+            if discriminant <= 0.0:
+                continue
+            root, b = np.sqrt(discriminant), ox * dx + oy * dy
+            side = (root - b) * per_c
+            upper, lower = dz * per_upper, dz * per_lower
+            cap = max(upper, lower) if above_cap else np.inf
+            near = min(side, cap)
+            if near <= nearness[v, u]:
+                continue
+            if near < max((-root - b) * per_c, min(upper, lower) if above_cap else max(upper, lower)):
+                continue
+            nearness[v, u] = near
+            tint = TINTS
+            if side <= cap:
+                tint = min(max(int(0.5 * TINTS + tint_scale * beside / near), 0), TINTS - 1)
+            for k in range(3):
+                image[v, u, k] = tints[tint, k]
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _tint_box(tints, paint, lights, origin):
+    """Update ``tints[:3]`` to the colours of the faces across x, y and z that are seen."""
+    _shade(tints[0], paint, lights, np.copysign(1.0, origin[0]), 0.0, 0.0)
+    _shade(tints[1], paint, lights, 0.0, np.copysign(1.0, origin[1]), 0.0)
+    _shade(tints[2], paint, lights, 0.0, 0.0, np.copysign(1.0, origin[2]))
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _tint_cylinder(tints, paint, lights, origin):
+    """Update ``tints`` to the colours across the side that is seen, and of its cap."""
+    distance = np.sqrt(origin[0] ** 2 + origin[1] ** 2)
+    x, y = origin[0] / distance, origin[1] / distance  # towards the camera, across the axis
+    for i in range(TINTS):
+        across = (2 * i + 1) / TINTS - 1.0
+        facing = np.sqrt(1.0 - across * across)
+        _shade(tints[i], paint, lights, facing * x - across * y, facing * y + across * x, 0.0)
+    _shade(tints[TINTS], paint, lights, 0.0, 0.0, np.copysign(1.0, origin[2]))
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _shade(pixel, paint, lights, nx, ny, nz):
+    """Update ``pixel`` (3,) to a surface's colour by Lambert's and Blinn's reflection."""
+    r, g, b = lights.ambient[0], lights.ambient[1], lights.ambient[2]
     shine_r = shine_g = shine_b = 0.0
-    for i in range(len(towards)):
-        facing = nx * towards[i, 0] + ny * towards[i, 1] + nz * towards[i, 2]
+    for i in range(len(lights.towards)):
+        towards, halfway = lights.towards[i], lights.halfway[i]
+        facing = nx * towards[0] + ny * towards[1] + nz * towards[2]
         if facing <= 0.0:
             continue
         r += facing * lights.diffuse[i, 0]
         g += facing * lights.diffuse[i, 1]
         b += facing * lights.diffuse[i, 2]
-        mirrored = nx * halfway[i, 0] + ny * halfway[i, 1] + nz * halfway[i, 2]
-        if mirrored > 0.8 and lights.specular[i, 0] > 0.0:
-            glint = paint[3] * np.exp(paint[4] * np.log(mirrored))
-            shine_r += glint * lights.specular[i, 0]
-            shine_g += glint * lights.specular[i, 1]
-            shine_b += glint * lights.specular[i, 2]
+        glint = nx * halfway[0] + ny * halfway[1] + nz * halfway[2]
+        if glint > GLOSSY:
+            for _ in range(int(paint[4])):
+                glint *= glint
+            shine_r += paint[3] * glint * lights.specular[i, 0]
+            shine_g += paint[3] * glint * lights.specular[i, 1]
+            shine_b += paint[3] * glint * lights.specular[i, 2]
     pixel[0] = np.uint8(255.0 * min(r * paint[0] + shine_r, 1.0) + 0.5)
     pixel[1] = np.uint8(255.0 * min(g * paint[1] + shine_g, 1.0) + 0.5)
     pixel[2] = np.uint8(255.0 * min(b * paint[2] + shine_b, 1.0) + 0.5)
@@ -182,7 +297,8 @@ def paint_texture(image, nearness, before, pinhole, size, position, rotation, te
     ``before`` is the nearness without the plane. Each pixel averages SAMPLES x SAMPLES texels.
     """
     origin = rotation.T @ (pinhole.centre - position)
-    directions = _pixel_directions(rotation.T @ pinhole.R_world_camera, pinhole.K)
+    rays = np.empty((3, 3))
+    _pixel_rays(rays, rotation.T @ pinhole.R_world_camera, pinhole.K)
     rows, columns = texture.shape[:2]
     for v in range(len(image)):
         for u in range(image.shape[1]):
@@ -192,7 +308,7 @@ def paint_texture(image, nearness, before, pinhole, size, position, rotation, te
             for k in range(SAMPLES * SAMPLES):
                 du = (k % SAMPLES + 0.5) / SAMPLES - 0.5
                 dv = (k // SAMPLES + 0.5) / SAMPLES - 0.5
-                d = directions[:, 0] * (u + du) + directions[:, 1] * (v + dv) + directions[:, 2]
+                d = rays[:, 0] * (u + du) + rays[:, 1] * (v + dv) + rays[:, 2]
                 depth = -origin[2] / d[2]
                 s = repeats[0] * (0.5 + 0.5 * (origin[0] + depth * d[0]) / size[0])
                 t = repeats[1] * (0.5 - 0.5 * (origin[1] + depth * d[1]) / size[1])
@@ -202,6 +318,3 @@ def paint_texture(image, nearness, before, pinhole, size, position, rotation, te
                 image[v, u, k] = np.uint8(
                     image[v, u, k] * total[k] / (255.0 * SAMPLES * SAMPLES) + 0.5
                 )
-
-
-SAMPLES = 4

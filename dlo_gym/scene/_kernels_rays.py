@@ -25,7 +25,7 @@ class Primitives(NamedTuple):
         sizes: (n, 3) half extents, or radius and half length [m].
         positions: (n, 3) centres in world [m].
         rotations: (n, 3, 3) ``R_world_body``.
-        paints: (n, 5) RGB in [0, 1], specular reflectance, its exponent.
+        paints: (n, 5) RGB in [0, 1], specular reflectance, log2 of its exponent.
     """
 
     kinds: NDArray[np.int32]

@@ -110,7 +110,7 @@ def _pinhole(camera: CameraModel) -> Pinhole:
 
 
 def _paints(model: mujoco.MjModel) -> Array:
-    """(n_geoms, 5) RGB, specular reflectance and its exponent of every geom."""
+    """(n_geoms, 5) RGB, specular reflectance and log2 of its exponent, of every geom."""
     paints = np.empty((model.ngeom, 5))
     for geom, material in enumerate(model.geom_matid):
         own = model.geom_rgba[geom]
@@ -119,7 +119,8 @@ def _paints(model: mujoco.MjModel) -> Array:
         paints[geom, 3:] = _REFLECTANCE
         if material >= 0:
             paints[geom, 3:] = model.mat_specular[material], model.mat_shininess[material]
-    paints[:, 4] *= _EXPONENT
+    # Rounded to a power of two, which takes a few squarings.
+    paints[:, 4] = np.round(np.log2(_EXPONENT * np.maximum(paints[:, 4], 1.0 / _EXPONENT)))
     return paints
 
 
