@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from dlo_gym.geometry.se3 import Array
-from dlo_gym.scene._kernels_rays import _FAST, BOX, CAPSULE, CYLINDER, PLANE, meet, normal
+from dlo_gym.scene._kernels_rays import FAST, BOX, CAPSULE, CYLINDER, PLANE, meet, normal
 
 TINTS = 64  # colours from one rim of a cylinder to the other
 SAMPLES = 4  # of a texture, across and down each pixel
@@ -44,7 +44,7 @@ class Lights(NamedTuple):
     ambient: Array
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def draw(image, nearness, pinhole, primitives, lights):
     """Update ``image`` (h, w, 3) and ``nearness`` (h, w) [1/m] where a primitive is nearer."""
     height = len(image)
@@ -159,7 +159,7 @@ def _widen(left, right, first, last, start, end):
         left[v], right[v] = min(left[v], u), max(right[v], u)
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _fill(image, nearness, spans, kind, size, origin, rays, paint, lights):
     """Update ``image`` and ``nearness`` inside an outline with one primitive of any kind."""
     first, last, left, right = spans
@@ -180,7 +180,7 @@ def _fill(image, nearness, spans, kind, size, origin, rays, paint, lights):
             _shade(image[v, u], paint, lights, nx, ny, nz)
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _fill_box(image, nearness, spans, size, origin, rays, tints):
     """Update ``image`` and ``nearness`` inside the exact outline of a box, given ``_tint_box``."""
     first, last, left, right = spans
@@ -196,7 +196,11 @@ def _fill_box(image, nearness, spans, size, origin, rays, tints):
         start_x, start_y, start_z = start[0], start[1], start[2]
         step_x, step_y, step_z = step[0], step[1], step[2]
         for u in range(int(np.ceil(left[v])), int(np.floor(right[v])) + 1):
-            near_x, near_y, near_z = start_x + step_x * u, start_y + step_y * u, start_z + step_z * u
+            near_x, near_y, near_z = (
+                start_x + step_x * u,
+                start_y + step_y * u,
+                start_z + step_z * u,
+            )
             near = min(near_x, near_y, near_z)
             if near <= nearness[v, u]:
                 continue
@@ -206,7 +210,7 @@ def _fill_box(image, nearness, spans, size, origin, rays, tints):
                 image[v, u, k] = tints[face, k]
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _fill_cylinder(image, nearness, spans, size, origin, rays, tints):
     """Update ``image`` and ``nearness`` inside an outline with a cylinder seen from beside its
     axis, given ``_tint_cylinder``; the equations are ``meet``'s."""
@@ -217,35 +221,38 @@ def _fill_cylinder(image, nearness, spans, size, origin, rays, tints):
     per_c = 1.0 / (ox * ox + oy * oy - radius_2)
     per_upper, per_lower = 1.0 / (size[1] - oz), 1.0 / (-size[1] - oz)
     above_cap = abs(oz) > size[1]
+    row = np.empty(image.shape[1])
     tint_scale = 0.5 * TINTS / (size[0] * np.sqrt(ox * ox + oy * oy))
     for v in range(first, last + 1):
         ex = rays[0, 1] * v + rays[0, 2]
         ey = rays[1, 1] * v + rays[1, 2]
         ez = rays[2, 1] * v + rays[2, 2]
-        for u in range(int(np.ceil(left[v])), int(np.floor(right[v])) + 1):
+        start, stop = int(np.ceil(left[v])), int(np.floor(right[v])) + 1
+        # Without a branch, so that the compiler makes it several pixels at a time.
+        for u in range(start, stop):
+            dx, dy, dz = ex + gx * u, ey + gy * u, ez + gz * u
+            beside, b = ox * dy - oy * dx, ox * dx + oy * dy
+            discriminant = radius_2 * (dx * dx + dy * dy) - beside * beside
+            root = np.sqrt(max(discriminant, 0.0))
+            upper, lower = dz * per_upper, dz * per_lower
+            cap = max(upper, lower)
+            near = min((root - b) * per_c, cap if above_cap else np.inf)
+            far = max((-root - b) * per_c, min(upper, lower) if above_cap else cap)
+            row[u] = near if discriminant > 0.0 and near >= far else 0.0
+        for u in range(start, stop):
+            if row[u] <= nearness[v, u]:
+                continue
+            nearness[v, u] = near = row[u]
             dx, dy, dz = ex + gx * u, ey + gy * u, ez + gz * u
             beside = ox * dy - oy * dx
-            discriminant = radius_2 * (dx * dx + dy * dy) - beside * beside
-            if discriminant <= 0.0:
-                continue
-            root, b = np.sqrt(discriminant), ox * dx + oy * dy
-            side = (root - b) * per_c
-            upper, lower = dz * per_upper, dz * per_lower
-            cap = max(upper, lower) if above_cap else np.inf
-            near = min(side, cap)
-            if near <= nearness[v, u]:
-                continue
-            if near < max((-root - b) * per_c, min(upper, lower) if above_cap else max(upper, lower)):
-                continue
-            nearness[v, u] = near
-            tint = TINTS
-            if side <= cap:
-                tint = min(max(int(0.5 * TINTS + tint_scale * beside / near), 0), TINTS - 1)
+            tint = min(max(int(0.5 * TINTS + tint_scale * beside / near), 0), TINTS - 1)
+            if above_cap and near > 0.999999 * max(dz * per_upper, dz * per_lower):
+                tint = TINTS
             for k in range(3):
                 image[v, u, k] = tints[tint, k]
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _tint_box(tints, paint, lights, origin):
     """Update ``tints[:3]`` to the colours of the faces across x, y and z that are seen."""
     _shade(tints[0], paint, lights, np.copysign(1.0, origin[0]), 0.0, 0.0)
@@ -253,7 +260,7 @@ def _tint_box(tints, paint, lights, origin):
     _shade(tints[2], paint, lights, 0.0, 0.0, np.copysign(1.0, origin[2]))
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _tint_cylinder(tints, paint, lights, origin):
     """Update ``tints`` to the colours across the side that is seen, and of its cap."""
     distance = np.sqrt(origin[0] ** 2 + origin[1] ** 2)
@@ -265,7 +272,7 @@ def _tint_cylinder(tints, paint, lights, origin):
     _shade(tints[TINTS], paint, lights, 0.0, 0.0, np.copysign(1.0, origin[2]))
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _shade(pixel, paint, lights, nx, ny, nz):
     """Update ``pixel`` (3,) to a surface's colour by Lambert's and Blinn's reflection."""
     r, g, b = lights.ambient[0], lights.ambient[1], lights.ambient[2]
@@ -290,7 +297,7 @@ def _shade(pixel, paint, lights, nx, ny, nz):
     pixel[2] = np.uint8(255.0 * min(b * paint[2] + shine_b, 1.0) + 0.5)
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def paint_texture(image, nearness, before, pinhole, size, position, rotation, texture, repeats):
     """Update ``image`` where a plane just became nearest, multiplying by its ``texture`` (h, w, 3).
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dlo_gym.geometry.se3 import Array
 
 PLANE, CAPSULE, CYLINDER, BOX = 0, 3, 5, 6
-_FAST = {"arcp", "contract", "nsz"}  # keeps NaN and infinity
+FAST = {"arcp", "contract", "nsz"}  # keeps NaN and infinity
 
 
 class Primitives(NamedTuple):
@@ -35,7 +35,7 @@ class Primitives(NamedTuple):
     paints: Array
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def meet(kind, size, ox, oy, oz, dx, dy, dz):
     """Nearness of a primitive's first hit."""
     if kind == BOX:
@@ -47,7 +47,7 @@ def meet(kind, size, ox, oy, oz, dx, dy, dz):
     return _meet_plane(size[0], size[1], ox, oy, oz, dx, dy, dz)
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _slab(half, o, d, near, far):
     """``near`` and ``far``, the nearness of entry and of exit, cut by -half <= o + t d <= half."""
     if abs(o) > half:
@@ -56,7 +56,7 @@ def _slab(half, o, d, near, far):
     return near, max(far, max(d / (half - o), d / (-half - o)))
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _meet_box(hx, hy, hz, ox, oy, oz, dx, dy, dz):
     near, far = _slab(hx, ox, dx, np.inf, 0.0)
     near, far = _slab(hy, oy, dy, near, far)
@@ -64,7 +64,7 @@ def _meet_box(hx, hy, hz, ox, oy, oz, dx, dy, dz):
     return near if far <= near < np.inf else 0.0
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _meet_cylinder(radius, half, ox, oy, oz, dx, dy, dz):
     a, b, c = dx * dx + dy * dy, ox * dx + oy * dy, ox * ox + oy * oy - radius * radius
     discriminant = b * b - a * c
@@ -76,7 +76,7 @@ def _meet_cylinder(radius, half, ox, oy, oz, dx, dy, dz):
     return near if far <= near < np.inf else 0.0
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _meet_capsule(radius, half, ox, oy, oz, dx, dy, dz):
     a, b, c = dx * dx + dy * dy, ox * dx + oy * dy, ox * ox + oy * oy - radius * radius
     z = oz
@@ -96,7 +96,7 @@ def _meet_capsule(radius, half, ox, oy, oz, dx, dy, dz):
     return (np.sqrt(discriminant) - b) / c
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def _meet_plane(hx, hy, ox, oy, oz, dx, dy, dz):
     near = -dz / oz
     if oz <= 0.0 or near <= 0.0:
@@ -104,7 +104,7 @@ def _meet_plane(hx, hy, ox, oy, oz, dx, dy, dz):
     return near if abs(ox * near + dx) <= hx * near and abs(oy * near + dy) <= hy * near else 0.0
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def normal(kind, size, x, y, z):
     """Outward unit normal of a primitive at a point of its surface."""
     if kind == BOX:
@@ -125,7 +125,7 @@ def normal(kind, size, x, y, z):
     return 0.0, 0.0, 1.0
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy")
 def first_hits(origin, directions, primitives):
     """Distances (n,) to the first hit along unit ``directions`` (n, 3); infinite for none."""
     nearness = np.zeros(len(directions))
@@ -159,6 +159,6 @@ def first_hits(origin, directions, primitives):
 def _bounding_radius(kind, size):
     if kind == BOX:
         return np.sqrt(size[0] ** 2 + size[1] ** 2 + size[2] ** 2)
-    if kind == CYLINDER or kind == PLANE:
+    if kind in (CYLINDER, PLANE):
         return np.sqrt(size[0] ** 2 + size[1] ** 2)
     return size[0] + size[1]

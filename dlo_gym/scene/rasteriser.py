@@ -12,14 +12,11 @@ from numpy.typing import NDArray
 from dlo_gym.geometry.camera import CameraModel
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.scene._kernels_raster import Lights, Pinhole, draw, paint_texture
-from dlo_gym.scene._kernels_rays import PLANE, Primitives
-
-_UNPAINTED = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that has none of its own
-_REFLECTANCE = (0.5, 0.5)  # MuJoCo's specular and shininess without a material
-_EXPONENT = 128.0  # of shininess 1
+from dlo_gym.scene._kernels_rays import PLANE
+from dlo_gym.scene.primitives import ModelPrimitives
 
 
-class _Layer(NamedTuple):
+class Layer(NamedTuple):
     """Colours (height, width, 3) and nearness (height, width), which is 1 / depth [1/m]."""
 
     rgb: NDArray[np.uint8]
@@ -27,20 +24,31 @@ class _Layer(NamedTuple):
 
 
 class RasterCanvas:
-    """Draws one model's geoms as its OpenGL canvas does, a little simpler and much faster."""
+    """Draws one model's geoms as its OpenGL canvas does, a little simpler and much faster.
+
+    The scenery, which never moves, is drawn once per camera.
+
+    Args:
+        model: the compiled scene.
+        scenery: ids of the geoms that never move.
+    """
 
     def __init__(self, model: mujoco.MjModel, scenery: NDArray[np.intp]) -> None:
         self._model = model
         self._fixed = scenery
         self._moving = np.setdiff1d(np.arange(model.ngeom), scenery)
-        self._paints = _paints(model)
-        self._scenery: dict[str, _Layer] = {}
+        self._primitives = ModelPrimitives(model)
+        self._scenery: dict[str, Layer] = {}
 
     def color(self, data: mujoco.MjData, name: str, pinhole: CameraModel) -> NDArray[np.uint8]:
         """RGB (height, width, 3) of the model's camera ``name``."""
+        return self.layer(data, name, pinhole).rgb
+
+    def layer(self, data: mujoco.MjData, name: str, pinhole: CameraModel) -> Layer:
+        """Colours and depth of the model's camera ``name``."""
         layer = self._copy_of_scenery(data, name, pinhole)
         self._draw(layer, data, pinhole, self._moving)
-        return layer.rgb
+        return layer
 
     def mask(
         self, data: mujoco.MjData, name: str, pinhole: CameraModel, geom_ids: NDArray[np.intp]
@@ -55,14 +63,15 @@ class RasterCanvas:
     def close(self) -> None:
         pass
 
-    def _copy_of_scenery(self, data: mujoco.MjData, name: str, pinhole: CameraModel) -> _Layer:
+    def _copy_of_scenery(self, data: mujoco.MjData, name: str, pinhole: CameraModel) -> Layer:
         if name not in self._scenery:
             shape = (pinhole.height, pinhole.width)
-            self._scenery[name] = _Layer(np.zeros((*shape, 3), np.uint8), np.zeros(shape))
+            self._scenery[name] = Layer(np.zeros((*shape, 3), np.uint8), np.zeros(shape))
             self._draw_scenery(self._scenery[name], data, pinhole)
-        return _Layer(*(part.copy() for part in self._scenery[name]))
+        scenery = self._scenery[name]
+        return Layer(scenery.rgb.copy(), scenery.nearness.copy())
 
-    def _draw_scenery(self, layer: _Layer, data: mujoco.MjData, pinhole: CameraModel) -> None:
+    def _draw_scenery(self, layer: Layer, data: mujoco.MjData, pinhole: CameraModel) -> None:
         model = self._model
         is_plane = model.geom_type[self._fixed] == PLANE
         self._draw(layer, data, pinhole, self._fixed[~is_plane])
@@ -86,42 +95,27 @@ class RasterCanvas:
 
     def _draw(
         self,
-        layer: _Layer,
+        layer: Layer,
         data: mujoco.MjData,
         pinhole: CameraModel,
         geom_ids: NDArray[np.intp],
     ) -> None:
         """Draws over ``layer`` those of the geoms that are not hidden."""
-        shown = geom_ids[self._model.geom_rgba[geom_ids, 3] > 0.0]
-        primitives = Primitives(
-            self._model.geom_type[shown],
-            self._model.geom_size[shown],
-            data.geom_xpos[shown],
-            data.geom_xmat[shown].reshape(-1, 3, 3),
-            self._paints[shown],
+        # The nearest first, so that little is painted over.
+        away = np.square(data.geom_xpos[geom_ids] - pinhole.centre).sum(axis=1)
+        nearest_first = geom_ids[np.argsort(away, kind="stable")]
+        draw(
+            layer.rgb,
+            layer.nearness,
+            _pinhole(pinhole),
+            self._primitives.posed(data, nearest_first),
+            _lights(self._model, data, pinhole),
         )
-        lights = _lights(self._model, data, pinhole)
-        draw(layer.rgb, layer.nearness, _pinhole(pinhole), primitives, lights)
 
 
 def _pinhole(camera: CameraModel) -> Pinhole:
     rotation = np.ascontiguousarray(camera.T_world_camera[:3, :3])
     return Pinhole(camera.K, rotation, np.ascontiguousarray(camera.centre))
-
-
-def _paints(model: mujoco.MjModel) -> Array:
-    """(n_geoms, 5) RGB, specular reflectance and log2 of its exponent, of every geom."""
-    paints = np.empty((model.ngeom, 5))
-    for geom, material in enumerate(model.geom_matid):
-        own = model.geom_rgba[geom]
-        plain = material < 0 or not np.allclose(own, _UNPAINTED)
-        paints[geom, :3] = own[:3] if plain else model.mat_rgba[material, :3]
-        paints[geom, 3:] = _REFLECTANCE
-        if material >= 0:
-            paints[geom, 3:] = model.mat_specular[material], model.mat_shininess[material]
-    # Rounded to a power of two, which takes a few squarings.
-    paints[:, 4] = np.round(np.log2(_EXPONENT * np.maximum(paints[:, 4], 1.0 / _EXPONENT)))
-    return paints
 
 
 def _lights(model: mujoco.MjModel, data: mujoco.MjData, pinhole: CameraModel) -> Lights:

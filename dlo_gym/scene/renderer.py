@@ -3,7 +3,9 @@
 # MuJoCo ships no type information.
 # pyright: reportAttributeAccessIssue=false
 
+from collections.abc import Callable
 from types import TracebackType
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -12,16 +14,36 @@ from numpy.typing import ArrayLike, NDArray
 from dlo_gym.geometry.camera import CameraModel, View
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryPoses
+from dlo_gym.scene._kernels_rays import first_hits
 from dlo_gym.scene.builder import SceneConfig, build_spec
 from dlo_gym.scene.lens import Lens
 from dlo_gym.scene.opengl_canvas import SCENERY_GROUP, OpenGlCanvas
+from dlo_gym.scene.primitives import ModelPrimitives
+from dlo_gym.scene.rasteriser import RasterCanvas
+
+
+class Canvas(Protocol):
+    """Draws one posed model as its cameras' pinholes see it."""
+
+    def color(self, data: mujoco.MjData, name: str, pinhole: CameraModel) -> NDArray[np.uint8]:
+        """RGB (height, width, 3) of the model's camera ``name``."""
+        ...
+
+    def mask(
+        self, data: mujoco.MjData, name: str, pinhole: CameraModel, geom_ids: NDArray[np.intp]
+    ) -> NDArray[np.uint8]:
+        """1 where a pixel (height, width) of camera ``name`` shows one of the geoms, else 0."""
+        ...
+
+    @property
+    def close(self) -> Callable[[], Any]: ...
 
 
 class SceneRenderer:
     """Poses the cell and draws it as its cameras see it.
 
-    Poses, visibility and collisions need no OpenGL; the headless context is made with the first
-    image. Use as a context manager, or call ``close``.
+    Poses, visibility, collisions and the rasteriser's images need no OpenGL; the headless context
+    is made with the first image. Use as a context manager, or call ``close``.
 
     Args:
         config: what stands in the cell and how it is drawn.
@@ -40,7 +62,8 @@ class SceneRenderer:
         fixed = np.setdiff1d(np.flatnonzero(self.model.geom_bodyid == 0), moving)
         self.model.geom_group[fixed] = SCENERY_GROUP
         self._positions: Array | None = None
-        self._canvas: OpenGlCanvas | None = None
+        self._primitives = ModelPrimitives(self.model)
+        self._canvas: Canvas | None = None
 
     def __enter__(self) -> "SceneRenderer":
         return self
@@ -127,7 +150,7 @@ class SceneRenderer:
         """The cell as one camera sees it.
 
         Raises:
-            RenderingUnavailable: if no headless OpenGL context can be made.
+            RenderingUnavailable: if it takes OpenGL and no headless context can be made.
         """
         lens = self._lens(camera_name)
         image = self._open_canvas().color(self.data, camera_name, lens.pinhole)
@@ -141,7 +164,7 @@ class SceneRenderer:
         """The pixels (height, width) that show the rod.
 
         Raises:
-            RenderingUnavailable: if no headless OpenGL context can be made.
+            RenderingUnavailable: if it takes OpenGL and no headless context can be made.
         """
         lens = self._lens(camera_name)
         mask = self._open_canvas().mask(self.data, camera_name, lens.pinhole, self._rod)
@@ -162,11 +185,8 @@ class SceneRenderer:
         distances = np.linalg.norm(rays, axis=1)
         rays /= distances[:, None]
         visible = np.array(camera.sees(camera.project(positions)))
-        geom = np.zeros(1, dtype=np.int32)
-        for i in np.flatnonzero(visible):
-            hit = mujoco.mj_ray(self.model, self.data, camera.centre, rays[i], None, True, -1, geom)
-            visible[i] = hit < 0 or hit >= distances[i] - self.config.rod_radius
-        return visible
+        hits = first_hits(camera.centre, rays, self._primitives.posed(self.data))
+        return visible & (hits >= distances - self.config.rod_radius)
 
     def arms_in_collision(self) -> bool:
         """Whether arms or grippers touch each other, themselves or the table."""
@@ -185,10 +205,14 @@ class SceneRenderer:
             raise ValueError("the scene has no pose yet: call update first")
         return self._positions
 
-    def _open_canvas(self) -> OpenGlCanvas:
+    def _open_canvas(self) -> Canvas:
         self._require_positions()
         if self._canvas is None:
-            self._canvas = OpenGlCanvas(self.model, shadows=self.config.quality == "high")
+            if self.config.renderer == "raster":
+                scenery = np.flatnonzero(self.model.geom_group == SCENERY_GROUP)
+                self._canvas = RasterCanvas(self.model, scenery)
+            else:
+                self._canvas = OpenGlCanvas(self.model, shadows=self.config.quality == "high")
         return self._canvas
 
 

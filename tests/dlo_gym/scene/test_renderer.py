@@ -8,7 +8,7 @@ import pytest
 from dlo_gym.exceptions import RenderingUnavailable, UnreachablePose
 from dlo_gym.geometry.se3 import exp_so3, pose
 from dlo_gym.rod.boundary import BoundaryPoses
-from dlo_gym.scene import renderer as renderer_module
+from dlo_gym.scene import opengl_canvas
 from dlo_gym.scene.builder import SceneConfig, default_cameras
 from dlo_gym.scene.renderer import SceneRenderer
 
@@ -208,7 +208,7 @@ def test_visibility_and_collisions_need_no_opengl(monkeypatch):
     def refuse(*_):
         raise RenderingUnavailable("no OpenGL in this test")
 
-    monkeypatch.setattr(renderer_module, "_open_context", refuse)
+    monkeypatch.setattr(opengl_canvas, "_open_context", refuse)
     with SceneRenderer(SceneConfig(cameras=default_cameras(0.25))) as scene:
         scene.update(*hanging())
         assert scene.visibility("side")[2:-2].all()
