@@ -56,10 +56,15 @@ def main() -> None:
     table = Table("environment", "steps per second")
     table.add_row("state", f"{environment_steps('dlo_gym/ShapeControl-v0', 500):.0f}")
     for height in (360, 720):
-        rate = environment_steps(
-            "dlo_gym/ShapeControlTracked-v0", 40, image_scale=height / 1080, n_occluders=1
-        )
-        table.add_row(f"tracked, {height * 16 // 9}x{height}", f"{rate:.1f}")
+        for renderer in ("opengl", "raster"):
+            rate = environment_steps(
+                "dlo_gym/ShapeControlTracked-v0",
+                40,
+                image_scale=height / 1080,
+                n_occluders=1,
+                renderer=renderer,
+            )
+            table.add_row(f"tracked, {height * 16 // 9}x{height}, {renderer}", f"{rate:.1f}")
     Console().print(table)
 
 

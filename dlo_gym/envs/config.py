@@ -13,6 +13,7 @@ CHOICES = {
     "observation_mode": ("state", "images"),
     "reward": ("dense", "sparse"),
     "clutter": ("none", "industrial"),
+    "renderer": ("opengl", "raster"),
     "quality": ("fast", "high"),
 }
 
@@ -50,7 +51,8 @@ class ShapeEnvConfig:
         clutter: ``"none"`` or ``"industrial"``.
         n_distractor_cables, n_occluders: in the scene; the occluders are boxes that move.
         occluder_size: their full extents in x, y, z [m].
-        quality: of the rendering, ``"fast"`` or ``"high"``.
+        renderer: ``"opengl"``, or ``"raster"``, which is faster on a CPU and needs no OpenGL.
+        quality: of the rendering, ``"fast"`` or ``"high"``, the latter with OpenGL only.
 
     Raises:
         ValueError: naming the option, what was expected and what came.
@@ -88,6 +90,7 @@ class ShapeEnvConfig:
     n_distractor_cables: int = 0
     n_occluders: int = 0
     occluder_size: tuple[float, float, float] = (0.12, 0.12, 0.12)
+    renderer: Literal["opengl", "raster"] = "opengl"
     quality: Literal["fast", "high"] = "fast"
 
     def __post_init__(self) -> None:
@@ -96,6 +99,8 @@ class ShapeEnvConfig:
                 raise ValueError(
                     f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}"
                 )
+        if self.renderer == "raster" and self.quality == "high":
+            raise ValueError('quality: expected "fast" with renderer "raster", got "high"')
         if self.observer != "privileged" and not _is_entry_point(self.observer):
             raise ValueError(
                 f"observer: expected 'privileged' or 'module:Class', got {self.observer!r}"

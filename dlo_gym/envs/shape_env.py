@@ -334,5 +334,6 @@ def _scene_config(config: ShapeEnvConfig) -> SceneConfig:
         n_distractor_cables=config.n_distractor_cables,
         n_occluders=config.n_occluders,
         occluder_size=config.occluder_size,
+        renderer=config.renderer,
         quality=config.quality,
     )

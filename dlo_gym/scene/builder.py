@@ -41,6 +41,8 @@ class SceneConfig:
         n_distractor_cables: other cables lying on the table.
         n_occluders: opaque boxes that ``SceneRenderer.update`` moves.
         occluder_size: full extents in x, y, z [m].
+        renderer: "opengl", or "raster" without OpenGL, several times as fast on a CPU, which
+            draws neither boards nor "high" quality.
         quality: "fast", or "high" with shadows and antialiasing.
         seed: of the distractor cables' curves.
         arms: where the arms stand.
@@ -58,6 +60,7 @@ class SceneConfig:
     n_distractor_cables: int = 0
     n_occluders: int = 0
     occluder_size: tuple[float, float, float] = (0.12, 0.08, 0.12)
+    renderer: Literal["opengl", "raster"] = "opengl"
     quality: Literal["fast", "high"] = "fast"
     seed: int = 0
     arms: DualArm = field(default_factory=DualArm)
@@ -79,11 +82,20 @@ class SceneConfig:
         color = np.asarray(self.rod_color, dtype=np.float64)
         if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
             raise ValueError(f"rod_color: expected RGB in [0, 1], got {self.rod_color}")
-        for name, choices in (("clutter", ("none", "industrial")), ("quality", ("fast", "high"))):
+        for name, choices in (
+            ("clutter", ("none", "industrial")),
+            ("renderer", ("opengl", "raster")),
+            ("quality", ("fast", "high")),
+        ):
             if getattr(self, name) not in choices:
                 raise ValueError(
                     f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}"
                 )
+        if self.renderer == "raster" and (self.quality != "fast" or self.boards):
+            raise ValueError(
+                'renderer: expected "opengl" for boards or quality "high", got "raster" with'
+                f" {len(self.boards)} boards and quality {self.quality!r}"
+            )
         for name in ("n_distractor_cables", "n_occluders"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")

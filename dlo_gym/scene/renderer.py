@@ -3,33 +3,47 @@
 # MuJoCo ships no type information.
 # pyright: reportAttributeAccessIssue=false
 
-import os
-import weakref
+from collections.abc import Callable
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any, Protocol
 
-import cv2
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dlo_gym.exceptions import RenderingUnavailable
 from dlo_gym.geometry.camera import CameraModel, View
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryPoses
+from dlo_gym.scene._kernels_rays import first_hits
 from dlo_gym.scene.builder import SceneConfig, build_spec
 from dlo_gym.scene.lens import Lens
+from dlo_gym.scene.opengl_canvas import SCENERY_GROUP, OpenGlCanvas
+from dlo_gym.scene.primitives import ModelPrimitives
+from dlo_gym.scene.rasteriser import RasterCanvas
 
-_SEGMENT_FLAGS = [int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]
-_RED = 255
-_SCENERY = 1  # geom group of what never moves
+
+class Canvas(Protocol):
+    """Draws one posed model as its cameras' pinholes see it."""
+
+    def color(self, data: mujoco.MjData, name: str, pinhole: CameraModel) -> NDArray[np.uint8]:
+        """RGB (height, width, 3) of the model's camera ``name``."""
+        ...
+
+    def mask(
+        self, data: mujoco.MjData, name: str, pinhole: CameraModel, geom_ids: NDArray[np.intp]
+    ) -> NDArray[np.uint8]:
+        """1 where a pixel (height, width) of camera ``name`` shows one of the geoms, else 0."""
+        ...
+
+    @property
+    def close(self) -> Callable[[], Any]: ...
 
 
 class SceneRenderer:
     """Poses the cell and draws it as its cameras see it.
 
-    Poses, visibility and collisions need no OpenGL; the headless context is made with the first
-    image. Use as a context manager, or call ``close``.
+    Poses, visibility, collisions and the rasteriser's images need no OpenGL; the headless context
+    is made with the first image. Use as a context manager, or call ``close``.
 
     Args:
         config: what stands in the cell and how it is drawn.
@@ -46,9 +60,10 @@ class SceneRenderer:
         self._occluders = _geoms(self.model, "occluder", self.config.n_occluders)
         moving = np.concatenate([self._rod, self._occluders])
         fixed = np.setdiff1d(np.flatnonzero(self.model.geom_bodyid == 0), moving)
-        self.model.geom_group[fixed] = _SCENERY
+        self.model.geom_group[fixed] = SCENERY_GROUP
         self._positions: Array | None = None
-        self._canvas: _Canvas | None = None
+        self._primitives = ModelPrimitives(self.model)
+        self._canvas: Canvas | None = None
 
     def __enter__(self) -> "SceneRenderer":
         return self
@@ -135,7 +150,7 @@ class SceneRenderer:
         """The cell as one camera sees it.
 
         Raises:
-            RenderingUnavailable: if no headless OpenGL context can be made.
+            RenderingUnavailable: if it takes OpenGL and no headless context can be made.
         """
         lens = self._lens(camera_name)
         image = self._open_canvas().color(self.data, camera_name, lens.pinhole)
@@ -149,7 +164,7 @@ class SceneRenderer:
         """The pixels (height, width) that show the rod.
 
         Raises:
-            RenderingUnavailable: if no headless OpenGL context can be made.
+            RenderingUnavailable: if it takes OpenGL and no headless context can be made.
         """
         lens = self._lens(camera_name)
         mask = self._open_canvas().mask(self.data, camera_name, lens.pinhole, self._rod)
@@ -172,11 +187,8 @@ class SceneRenderer:
         distances = np.linalg.norm(rays, axis=1)
         rays /= distances[:, None]
         visible = np.array(camera.sees(camera.project(positions)))
-        geom = np.zeros(1, dtype=np.int32)
-        for i in np.flatnonzero(visible):
-            hit = mujoco.mj_ray(self.model, self.data, camera.centre, rays[i], None, True, -1, geom)
-            visible[i] = hit < 0 or hit >= distances[i] - self.config.rod_radius
-        return visible
+        hits = first_hits(camera.centre, rays, self._primitives.posed(self.data))
+        return visible & (hits >= distances - self.config.rod_radius)
 
     def arms_in_collision(self) -> bool:
         """Whether arms or grippers touch each other, themselves or the table."""
@@ -195,10 +207,14 @@ class SceneRenderer:
             raise ValueError("the scene has no pose yet: call update first")
         return self._positions
 
-    def _open_canvas(self) -> "_Canvas":
+    def _open_canvas(self) -> Canvas:
         self._require_positions()
         if self._canvas is None:
-            self._canvas = _Canvas(self.model, shadows=self.config.quality == "high")
+            if self.config.renderer == "raster":
+                scenery = np.flatnonzero(self.model.geom_group == SCENERY_GROUP)
+                self._canvas = RasterCanvas(self.model, scenery)
+            else:
+                self._canvas = OpenGlCanvas(self.model, shadows=self.config.quality == "high")
         return self._canvas
 
 
@@ -214,116 +230,3 @@ def _facing_points(positions: Array, centre: Array, radius: float) -> Array:
     across = towards - (towards * tangents).sum(axis=1, keepdims=True) * tangents
     norms = np.linalg.norm(across, axis=1, keepdims=True)
     return positions + radius * across / np.maximum(norms, 1e-12)
-
-
-class _Layer(NamedTuple):
-    """Colours (height, width, 3) and OpenGL depths (height, width) in [0, 1], rows upwards.
-
-    Without depths where shadows are drawn.
-    """
-
-    rgb: NDArray[np.uint8]
-    depth: NDArray[np.float32] | None
-
-
-class _Canvas:
-    """An offscreen framebuffer of one model, with its OpenGL context."""
-
-    def __init__(self, model: mujoco.MjModel, *, shadows: bool) -> None:
-        self._model = model
-        self._option = mujoco.MjvOption()
-        self._shown = self._option.geomgroup.copy()
-        self._shadows = shadows
-        self._scenery: dict[str, _Layer] = {}
-        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 64)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = False
-        self._gl, self._context = _open_context(model)
-        self.close = weakref.finalize(self, _free_context, self._gl, self._context)
-        self.close.atexit = False  # MuJoCo's own exit handler may have ended EGL by then
-
-    def color(self, data: mujoco.MjData, name: str, pinhole: CameraModel) -> NDArray[np.uint8]:
-        """RGB (height, width, 3) of the model's camera ``name``.
-
-        Cameras and scenery stand still, so the scenery is drawn once per camera, and what moves is
-        laid over it by depth; pixel for pixel the same. Shadows fall on scenery: then all is drawn.
-        """
-        if self._shadows:
-            self._look(data, name)
-            return cv2.flip(self._draw(pinhole).rgb, 0)  # type: ignore[return-value]
-        if name not in self._scenery:
-            self._option.geomgroup[:] = np.arange(len(self._option.geomgroup)) == _SCENERY
-            self._look(data, name)
-            self._scenery[name] = self._draw(pinhole)
-        scenery = self._scenery[name]
-        self._option.geomgroup[:] = self._shown
-        self._option.geomgroup[_SCENERY] = 0
-        self._look(data, name)
-        self._option.geomgroup[:] = self._shown
-        moving = self._draw(pinhole)
-        rgb = scenery.rgb.copy()
-        nearer = cv2.compare(moving.depth, scenery.depth, cv2.CMP_LT)  # type: ignore[arg-type]
-        cv2.copyTo(moving.rgb, nearer, rgb)
-        return cv2.flip(rgb, 0)  # type: ignore[return-value]
-
-    def mask(
-        self, data: mujoco.MjData, name: str, pinhole: CameraModel, geom_ids: NDArray[np.intp]
-    ) -> NDArray[np.uint8]:
-        """1 where a pixel (height, width) of camera ``name`` shows one of the geoms, else 0."""
-        self._look(data, name)
-        wanted = set(geom_ids.tolist())
-        for geom in self._scene.geoms[: self._scene.ngeom]:
-            # MuJoCo draws segment i in the 24-bit colour i + 1, red first.
-            geom.segid = _RED - 1 if geom.objid in wanted else 0
-        self._scene.flags[_SEGMENT_FLAGS] = True
-        try:
-            return np.ascontiguousarray(self._draw(pinhole).rgb[::-1, :, 0] == _RED).view(np.uint8)
-        finally:
-            self._scene.flags[_SEGMENT_FLAGS] = False
-
-    def _look(self, data: mujoco.MjData, name: str) -> None:
-        camera = mujoco.MjvCamera()
-        camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        camera.fixedcamid = self._model.camera(name).id
-        mujoco.mjv_updateScene(
-            self._model, data, self._option, None, camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
-        )
-
-    def _draw(self, pinhole: CameraModel) -> "_Layer":
-        """What the scene holds; OpenGL's rows go upwards."""
-        self._gl.make_current()
-        rectangle = mujoco.MjrRect(0, 0, pinhole.width, pinhole.height)
-        mujoco.mjr_render(rectangle, self._scene, self._context)
-        rgb = np.empty((pinhole.height, pinhole.width, 3), dtype=np.uint8)
-        depth = None
-        if not self._shadows:
-            depth = np.empty((pinhole.height, pinhole.width), dtype=np.float32)
-        mujoco.mjr_readPixels(rgb, depth, rectangle, self._context)
-        return _Layer(rgb, depth)
-
-
-def _open_context(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
-    """A current OpenGL context of MUJOCO_GL's kind (EGL if unset) with the model's data in it."""
-    backend = os.environ.setdefault("MUJOCO_GL", "egl").lower()
-    try:
-        if backend == "egl":
-            from mujoco.egl import GLContext
-        else:
-            from mujoco.gl_context import GLContext
-        gl = GLContext(model.vis.global_.offwidth, model.vis.global_.offheight)
-        gl.make_current()
-        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
-    except Exception as error:  # PyOpenGL fails in as many ways as there are broken installations
-        raise RenderingUnavailable(
-            f"no headless OpenGL context (MUJOCO_GL={backend}): {error}; on Debian and Ubuntu:"
-            "  apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
-        ) from error
-    return gl, context
-
-
-def _free_context(gl: Any, context: mujoco.MjrContext) -> None:
-    gl.make_current()
-    context.free()
-    gl.free()

@@ -46,6 +46,7 @@ def test_an_unknown_option_is_named_and_the_valid_ones_are_listed():
         ("workspace", (0.4, 0.5)),
         ("clutter", "office"),
         ("n_occluders", -1),
+        ("renderer", "vulkan"),
         ("quality", "best"),
         ("cameras", ("side",)),
     ],
@@ -59,3 +60,8 @@ def test_start_distance_is_judged_by_the_rods_own_length():
     with pytest.raises(ValueError, match="start_distance"):
         ShapeEnvConfig(properties=RodProperties(length=0.38))
     assert np.isclose(ShapeEnvConfig(properties=RodProperties(length=0.6)).start_distance, 0.4)
+
+
+def test_the_rasteriser_has_one_quality():
+    with pytest.raises(ValueError, match='quality: expected "fast" with renderer "raster"'):
+        ShapeEnvConfig(renderer="raster", quality="high")

@@ -319,8 +319,20 @@ def test_the_tracked_environment_follows_the_rod(opengl):
     env.close()
 
 
-def test_tracked_environments_with_one_seed_agree_exactly(opengl):
-    envs = [gym.make(TRACKED_ID, n_occluders=1, image_scale=0.35) for _ in range(2)]
+def test_the_tracker_does_as_well_on_the_rasterisers_images(opengl):
+    means = {}
+    for name in ("opengl", "raster"):
+        env = gym.make(TRACKED_ID, n_occluders=1, image_scale=1 / 3, renderer=name)
+        steps = rollout(env, 1, 15)
+        means[name] = np.mean([info["tracking_ptp3d"] for *_, info in steps[1:]])
+        env.close()
+    assert 1e-5 < means["raster"] < 1.25 * means["opengl"] + 1e-4
+
+
+@pytest.mark.parametrize("name", ["opengl", "raster"])
+def test_tracked_environments_with_one_seed_agree_exactly(opengl, name):
+    options = {"n_occluders": 1, "image_scale": 0.35, "renderer": name}
+    envs = [gym.make(TRACKED_ID, **options) for _ in range(2)]
     assert_equal_rollouts(*[rollout(env, 3, 3) for env in envs])
     for env in envs:
         env.close()

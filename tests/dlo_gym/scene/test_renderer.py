@@ -8,7 +8,7 @@ import pytest
 from dlo_gym.exceptions import RenderingUnavailable, UnreachablePose
 from dlo_gym.geometry.se3 import exp_so3, pose
 from dlo_gym.rod.boundary import BoundaryPoses
-from dlo_gym.scene import renderer as renderer_module
+from dlo_gym.scene import opengl_canvas
 from dlo_gym.scene.builder import SceneConfig, default_cameras
 from dlo_gym.scene.renderer import SceneRenderer
 
@@ -47,10 +47,15 @@ def opened(config, positions=None):
     return scene
 
 
-@pytest.fixture(scope="module")
-def plain():
+@pytest.fixture(scope="module", params=["opengl", "raster"])
+def plain(request):
     panel = (0.14, 0.012, 0.14)
-    config = SceneConfig(cameras=default_cameras(0.5), n_occluders=1, occluder_size=panel)
+    config = SceneConfig(
+        cameras=default_cameras(0.5),
+        n_occluders=1,
+        occluder_size=panel,
+        renderer=request.param,
+    )
     with opened(config) as scene:
         yield scene
 
@@ -69,15 +74,17 @@ def offsets_across(mask, pixels, nodes):
     return np.array(offsets)
 
 
-@pytest.mark.parametrize("quality", ["fast", "high"])
+@pytest.mark.parametrize(
+    ("renderer", "quality"), [("opengl", "fast"), ("opengl", "high"), ("raster", "fast")]
+)
 @pytest.mark.parametrize("distortion", [None, [-0.25, 0.08, 0.002, -0.003, -0.01]])
 @pytest.mark.parametrize("name", ["side", "top"])
-def test_projected_nodes_lie_on_the_rendered_rod(name, distortion, quality):
+def test_projected_nodes_lie_on_the_rendered_rod(name, distortion, renderer, quality):
     # Off-centre principal point and unequal focal lengths: each must have its own effect.
     K = np.array([[720.0, 0.0, 455.0], [0.0, 690.0, 290.0], [0.0, 0.0, 1.0]])
     camera = next(c for c in default_cameras(0.5) if c.name == name)
     camera = replace(camera, K=K, distortion=None if distortion is None else np.array(distortion))
-    with opened(SceneConfig(cameras=(camera,), quality=quality)) as scene:
+    with opened(SceneConfig(cameras=(camera,), renderer=renderer, quality=quality)) as scene:
         mask = scene.rod_mask(name)
         offsets = offsets_across(mask, camera.project(hanging()[0]), range(2, N_NODES - 2))
         assert np.abs(offsets).max() < 0.5
@@ -223,7 +230,7 @@ def test_visibility_and_collisions_need_no_opengl(monkeypatch):
     def refuse(*_):
         raise RenderingUnavailable("no OpenGL in this test")
 
-    monkeypatch.setattr(renderer_module, "_open_context", refuse)
+    monkeypatch.setattr(opengl_canvas, "_open_context", refuse)
     with SceneRenderer(SceneConfig(cameras=default_cameras(0.25))) as scene:
         scene.update(*hanging())
         assert scene.visibility("side")[2:-2].all()
