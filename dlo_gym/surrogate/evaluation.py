@@ -9,9 +9,11 @@ from rich.table import Table
 from dlo_gym.geometry.se3 import Array, pose, quaternion_to_matrix
 from dlo_gym.metrics import ptp_3d
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
+from dlo_gym.rod.properties import RodProperties
 from dlo_gym.surrogate.simulation import Rollouts
 
 Predict = Callable[[Array, BoundaryDisplacement], Array]
+PredictFor = Callable[[RodProperties], Predict]
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Score:
 
 
 def evaluate_predictor(
-    predict: Predict,
+    predict_for: PredictFor,
     rollouts: Rollouts,
     *,
     n_steps: tuple[int, ...] = (0, 1, 2, 3),
@@ -47,16 +49,21 @@ def evaluate_predictor(
     """Scores for moves of each of ``n_steps``, from every ``stride``-th state of the rollouts.
 
     Args:
-        predict: the centerline (n, 3) after a displacement.
+        predict_for: from a rod's properties, its ``predict``: the centerline (n, 3) after a
+            displacement.
         noise: standard deviation added to the coordinates that ``predict`` is given [m]; the error
             is then that of the predicted change.
         seed: of the noise.
     """
     rng = np.random.default_rng(seed)
     scores = []
+    predictors = [predict_for(rollouts.properties(i)) for i in range(len(rollouts.rods))]
     for steps in n_steps:
         errors, motions = [], []
-        for positions, clamps in zip(rollouts.positions, rollouts.clamps, strict=True):
+        for i, (positions, clamps) in enumerate(
+            zip(rollouts.positions, rollouts.clamps, strict=True)
+        ):
+            predict = predictors[i]
             states = positions.astype(np.float64)
             boundaries = [boundary(x, c) for x, c in zip(states, clamps, strict=True)]
             for first in range(0, len(states) - steps, stride):

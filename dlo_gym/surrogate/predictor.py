@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
+from dlo_gym.rod.properties import RodProperties
 from dlo_gym.surrogate.weights_file import SHIPPED, Weights, load_weights
 
 Float = NDArray[Any]  # of the network's dtype
@@ -21,19 +22,27 @@ class ShapePredictor:
 
     Around the paper's network (Section IV-B1) stand what is known without learning: the rod's
     behaviour does not depend on its place and heading, a null action moves nothing, the first and
-    last elements follow their clamps. Rotation about the rod's own axis is without effect.
+    last elements follow their clamps, and what the rod is made of matters by dimensionless groups
+    alone. Rotation about the rod's own axis is without effect.
 
     Derivatives are hand-written forward-mode tangents.
 
     Args:
         weights: as loaded by ``load_weights``.
+        properties: of the rod; the paper's rod of 0.5 m when omitted.
         dtype: of the network's arithmetic; all else is float64.
     """
 
-    def __init__(self, weights: Weights, dtype: DTypeLike = np.float32) -> None:
-        layers, self._scales = weights.layers, weights.scales
+    def __init__(
+        self,
+        weights: Weights,
+        properties: RodProperties | None = None,
+        dtype: DTypeLike = np.float32,
+    ) -> None:
+        self._weights, self._dtype = weights, np.dtype(dtype)
+        self.properties = RodProperties(length=0.5) if properties is None else properties
         self.training = weights.training
-        self._dtype = np.dtype(dtype)
+        layers, self._scales, *_ = weights.for_rod(self.properties)
         self._state, self._action, prediction = (
             [(weight.astype(dtype), bias.astype(dtype)) for weight, bias in block]
             for block in layers[:3]
@@ -49,13 +58,23 @@ class ShapePredictor:
         self._still, _ = self._actions(self._null, None)
 
     @classmethod
-    def load(cls, path: Path | None = None) -> "ShapePredictor":
+    def load(
+        cls, path: Path | None = None, properties: RodProperties | None = None
+    ) -> "ShapePredictor":
         """From a file of ``dlo train-surrogate``; the shipped weights by default.
 
         Raises:
             WeightsError: if the file is missing, damaged or of another version.
         """
-        return cls(load_weights(SHIPPED if path is None else Path(path)))
+        return cls(load_weights(SHIPPED if path is None else Path(path)), properties)
+
+    def for_rod(self, properties: RodProperties) -> "ShapePredictor":
+        """The same network for another rod.
+
+        Rods beyond those of its training are taken for the nearest of them, of one that is not
+        uniform its means (see ``conditioning.groups``).
+        """
+        return ShapePredictor(self._weights, properties, self._dtype)
 
     @property
     def n_nodes(self) -> int:

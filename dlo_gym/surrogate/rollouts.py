@@ -3,7 +3,7 @@
 A dataset is a folder:
 
     manifest.json     schema, settings, and the sha256 of every finished shard
-    shard_0000.npz    positions, clamps, lengths of ``shard_size`` rollouts, without pickle
+    shard_0000.npz    positions, clamps, rods of ``shard_size`` rollouts, without pickle
 
 Rollout i is made from its own child of the seed, so that the data depend neither on the number of
 workers nor on where a run was interrupted. Shards and manifest are written aside and renamed; a
@@ -34,7 +34,7 @@ from dlo_gym.atomic_file import written_aside
 from dlo_gym.exceptions import DatasetError
 from dlo_gym.surrogate.simulation import Rollouts, RolloutSettings, simulate_rollout
 
-SCHEMA = "dlo-rollouts/1"
+SCHEMA = "dlo-rollouts/2"
 THE_PAPER = RolloutSettings()  # Section VI-A1
 
 
@@ -57,7 +57,10 @@ class Manifest(NamedTuple):
         try:
             content = json.loads(file.read_text())
             if content["schema"] != SCHEMA:
-                raise DatasetError(f"{file}: expected schema {SCHEMA}, got {content['schema']}")
+                raise DatasetError(
+                    f"{file}: expected schema {SCHEMA}, got {content['schema']}; make the data"
+                    " again by  dlo rollouts --overwrite"
+                )
             return cls(RolloutSettings(**content["settings"]), dict(content["shards"]))
         except FileNotFoundError:
             raise DatasetError(f"{folder}: no manifest.json, so this is not a dataset") from None
