@@ -77,9 +77,10 @@ def _in_processes(
             except BrokenProcessPool as error:
                 deaths += 1
                 if deaths == ATTEMPTS:
+                    plural = "" if len(left) == 1 else "s"
                     raise WorkersLost(
                         f"a worker process was killed {deaths} times in a row with"
-                        f" {len(left)} tasks left, perhaps for memory; try fewer workers"
+                        f" {len(left)} task{plural} left, perhaps for memory; try fewer workers"
                     ) from error
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)

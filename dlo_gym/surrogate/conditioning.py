@@ -29,7 +29,7 @@ class Conditioning(NamedTuple):
 
     Attributes:
         low, high: (4,) range of the groups in training; rods beyond it are taken for its edge.
-        embedding: 4 -> E -> E, two layers.
+        embedding: 4 -> D -> E, two layers, each followed by ReLU.
         modulation: (2 M, E) and (2 M,), from the embedding to the gains, less one, and the shifts
             of the M units of all layers in order.
     """

@@ -56,24 +56,16 @@ def evaluate_predictor(
         seed: of the noise.
     """
     rng = np.random.default_rng(seed)
-    scores = []
     predictors = [predict_for(rollouts.properties(i)) for i in range(len(rollouts.rods))]
+    scores = []
     for steps in n_steps:
         errors, motions = [], []
-        for i, (positions, clamps) in enumerate(
-            zip(rollouts.positions, rollouts.clamps, strict=True)
-        ):
-            predict = predictors[i]
-            states = positions.astype(np.float64)
-            boundaries = [boundary(x, c) for x, c in zip(states, clamps, strict=True)]
-            for first in range(0, len(states) - steps, stride):
-                last = first + steps
-                displacement = boundaries[first].displacement_to(boundaries[last])
-                offset = noise * rng.standard_normal(states[first].shape)
-                predicted = predict(states[first] + offset, displacement) - offset
-                errors.append(ptp_3d(predicted, states[last]))
-                motions.append(ptp_3d(states[first], states[last]))
-        error = 1e3 * np.array(errors)
+        for i, predict in enumerate(predictors):
+            states = rollouts.positions[i].astype(np.float64)
+            errors.append(move_errors(predict, rollouts, i, steps, stride, noise, rng))
+            motion = ptp_3d(states[: len(states) - steps : stride], states[steps::stride])
+            motions.append(motion)
+        error = 1e3 * np.concatenate(errors)
         mean = error.mean(axis=1)
         scores.append(
             Score(
@@ -82,10 +74,32 @@ def evaluate_predictor(
                 float(mean.mean()),
                 float(np.percentile(mean, 95)),
                 float(error.max()),
-                float(1e3 * np.mean(motions)),
+                float(1e3 * np.concatenate(motions).mean()),
             )
         )
     return scores
+
+
+def move_errors(
+    predict: Predict,
+    rollouts: Rollouts,
+    index: int,
+    steps: int,
+    stride: int = 1,
+    noise: float = 0.0,
+    rng: np.random.Generator | None = None,
+) -> Array:
+    """PTP3D (n_moves, n) of ``predict`` per node, for moves of ``steps`` in one rollout [m]."""
+    states = rollouts.positions[index].astype(np.float64)
+    boundaries = [boundary(x, c) for x, c in zip(states, rollouts.clamps[index], strict=True)]
+    errors = []
+    for first in range(0, len(states) - steps, stride):
+        last = first + steps
+        displacement = boundaries[first].displacement_to(boundaries[last])
+        offset = noise * rng.standard_normal(states[first].shape) if noise and rng else 0.0
+        predicted = predict(states[first] + offset, displacement) - offset
+        errors.append(ptp_3d(predicted, states[last]))
+    return np.array(errors)
 
 
 def boundary(positions: Array, clamps: Array) -> BoundaryPoses:

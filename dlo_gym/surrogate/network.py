@@ -11,24 +11,28 @@ from dlo_gym.surrogate.dataset import Batch
 from dlo_gym.surrogate.weights_file import ACTION_SIZE, DEPTHS, Layers
 
 HIDDEN = 256
-EMBEDDING = 32
+EMBEDDING = (32, 16)
 NOISE_FLOOR = 0.02  # of the whitening, in units of the network's input
 
 
 class DloNetwork(nn.Module):
-    """State block, action block shared by both clamps, prediction block; ReLU between layers.
+    """State block, action block shared by both clamps, prediction block.
 
     Args:
         n_nodes: of the rod.
         hidden: width of the state and prediction blocks, twice that of the action block.
+        activation: between the layers.
     """
 
-    def __init__(self, n_nodes: int, hidden: int = HIDDEN) -> None:
+    def __init__(
+        self, n_nodes: int, hidden: int = HIDDEN, activation: type[nn.Module] = nn.ReLU
+    ) -> None:
         super().__init__()
         size, half = 3 * n_nodes, hidden // 2
-        self.state = _layers(size, hidden, hidden, hidden)
-        self.action = _layers(ACTION_SIZE, half, half)
-        self.prediction = _layers(2 * hidden, hidden, hidden, hidden, size)[:-1]
+        self.state = _layers(size, hidden, hidden, hidden, activation=activation)
+        self.action = _layers(ACTION_SIZE, half, half, activation=activation)
+        widths = (2 * hidden, hidden, hidden, hidden, size)
+        self.prediction = _layers(*widths, activation=activation)[:-1]
 
     def forward(self, state: Tensor, actions: Tensor) -> Tensor:
         """The change (B, 3 n) of states (B, 3 n) under actions (B, 2, 7), in network units."""
@@ -42,6 +46,7 @@ class RelativeNetwork(nn.Module):
     The state enters ``f`` in whitened principal components, because the bends that matter are
     small beside the rod's extent; exported weights contain the whitening. An embedding of the rod's
     groups scales and shifts the units of every layer, and turns the guess (``conditioning.py``).
+    SiLU takes ReLU's place: a rod's answer is smooth.
     """
 
     state_mean: Tensor
@@ -54,12 +59,12 @@ class RelativeNetwork(nn.Module):
     def __init__(self, n_nodes: int, hidden: int = HIDDEN) -> None:
         super().__init__()
         size = 3 * n_nodes
-        self.network = f = DloNetwork(n_nodes, hidden)
-        self.embedding = _layers(N_GROUPS, EMBEDDING, EMBEDDING)
+        self.network = f = DloNetwork(n_nodes, hidden, nn.SiLU)
+        self.embedding = _layers(N_GROUPS, *EMBEDDING, activation=nn.ReLU)
         blocks = (f.state, f.action, f.prediction)
         layers = [m for block in blocks for m in block.children() if isinstance(m, nn.Linear)]
         self.units = [layer.out_features for layer in layers]
-        self.modulation = nn.Linear(EMBEDDING, 2 * sum(self.units))
+        self.modulation = nn.Linear(EMBEDDING[-1], 2 * sum(self.units))
         with torch.no_grad():
             self.modulation.weight.mul_(0.1)
             self.modulation.bias.zero_()
@@ -156,10 +161,10 @@ def _modulated(block: nn.Sequential, value: Tensor, units: list[tuple[Tensor, Te
     return value
 
 
-def _layers(*sizes: int) -> nn.Sequential:
+def _layers(*sizes: int, activation: type[nn.Module]) -> nn.Sequential:
     parts: list[nn.Module] = []
     for i in range(len(sizes) - 1):
-        parts += [nn.Linear(sizes[i], sizes[i + 1]), nn.ReLU()]
+        parts += [nn.Linear(sizes[i], sizes[i + 1]), activation()]
     return nn.Sequential(*parts)
 
 

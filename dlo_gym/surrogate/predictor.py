@@ -1,5 +1,6 @@
 """The rod's surrogate at run time: NumPy in, NumPy out, with exact derivatives."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,7 +43,8 @@ class ShapePredictor:
         self._weights, self._dtype = weights, np.dtype(dtype)
         self.properties = RodProperties(length=0.5) if properties is None else properties
         self.training = weights.training
-        layers, self._scales, *_ = weights.for_rod(self.properties)
+        layers, self._scales, *_, activation = weights.for_rod(self.properties)
+        self._activation = ACTIVATIONS[activation]
         self._state, self._action, prediction = (
             [(weight.astype(dtype), bias.astype(dtype)) for weight, bias in block]
             for block in layers[:3]
@@ -218,10 +220,10 @@ class ShapePredictor:
         """The change (n, 3) and its tangents (n, 3, k): guess(A) + f(S, A) - f(S, 0)."""
         state, dstate = (x / self._scales.position).astype(self._dtype).ravel(), None
         if dx is None:
-            state = self._from_state @ _forward(self._state, state)
+            state = self._from_state @ _forward(self._state, state, self._activation)
         else:
             dstate = (dx / self._scales.position).astype(self._dtype).reshape(len(state), -1)
-            state, dstate = _forward_tangents(self._state, state, dstate)
+            state, dstate = _forward_tangents(self._state, state, dstate, self._activation)
             state, dstate = self._from_state @ state, self._from_state @ dstate
         moved, dmoved = self._actions(actions, dactions)
         if dmoved is not None and dstate is not None:
@@ -242,9 +244,11 @@ class ShapePredictor:
         value, tangents = self._bias, None
         for i, block in enumerate(self._from_actions):
             if dactions is None:
-                value = value + block @ _forward(self._action, actions[i])
+                value = value + block @ _forward(self._action, actions[i], self._activation)
                 continue
-            embedded, dembedded = _forward_tangents(self._action, actions[i], dactions[i])
+            embedded, dembedded = _forward_tangents(
+                self._action, actions[i], dactions[i], self._activation
+            )
             value = value + block @ embedded
             tangents = block @ dembedded if tangents is None else tangents + block @ dembedded
         return value, tangents
@@ -255,12 +259,11 @@ class ShapePredictor:
         return self._scales.change * change.astype(np.float64)
 
     def _inner_layers(self, value: Float, tangents: Float | None) -> tuple[Float, Float | None]:
-        """From the sum that enters the prediction block's first ReLU to its last ReLU."""
-        active = value > 0
-        value = value * active
+        """From the sum that enters the prediction block's first activation to its last one."""
         if tangents is None:
-            return _forward(self._inner, value), None
-        return _forward_tangents(self._inner, value, tangents * active[:, None])
+            return _forward(self._inner, self._activation.value(value), self._activation), None
+        value, slope = self._activation.value_and_slope(value)
+        return _forward_tangents(self._inner, value, tangents * slope[:, None], self._activation)
 
 
 class _End(NamedTuple):
@@ -322,19 +325,53 @@ def _end_tangents(end: _End, dtwist: Array, dedge: Array | None) -> _EndTangents
     )
 
 
-def _forward(layers: list[Layer], value: Float) -> Float:
+class _Activation(NamedTuple):
+    """Elementwise: the function alone, and with its derivative."""
+
+    value: Callable[[Float], Float]
+    value_and_slope: Callable[[Float], tuple[Float, Float]]
+
+
+def _relu(x: Float) -> Float:
+    return np.maximum(x, 0.0)
+
+
+def _relu_and_slope(x: Float) -> tuple[Float, Float]:
+    active = x > 0
+    return x * active, active
+
+
+def _silu(x: Float) -> Float:
+    half = 0.5 * x
+    return half + half * np.tanh(half)
+
+
+def _silu_and_slope(x: Float) -> tuple[Float, Float]:
+    half = 0.5 * x
+    sigmoid = 0.5 + 0.5 * np.tanh(half)
+    value = x * sigmoid
+    return value, sigmoid + value * (1.0 - sigmoid)
+
+
+ACTIVATIONS = {
+    "relu": _Activation(_relu, _relu_and_slope),
+    "silu": _Activation(_silu, _silu_and_slope),
+}
+
+
+def _forward(layers: list[Layer], value: Float, activation: _Activation) -> Float:
     for weight, bias in layers:
-        value = np.maximum(weight @ value + bias, 0.0)
+        value = activation.value(weight @ value + bias)
     return value
 
 
-def _forward_tangents(layers: list[Layer], value: Float, tangents: Float) -> tuple[Float, Float]:
+def _forward_tangents(
+    layers: list[Layer], value: Float, tangents: Float, activation: _Activation
+) -> tuple[Float, Float]:
     for weight, bias in layers:
-        value = weight @ value + bias
-        active = value > 0
-        value = value * active
+        value, slope = activation.value_and_slope(weight @ value + bias)
         tangents = weight @ tangents
-        tangents *= active[:, None]
+        tangents *= slope[:, None]
     return value, tangents
 
 

@@ -155,7 +155,7 @@ class Trainer:
         network = self.best_network()
         assert isinstance(network, RelativeNetwork)
         layers, conditioning = network.export()
-        return Weights(layers, self.scales, training, conditioning)
+        return Weights(layers, self.scales, training, conditioning, "silu")
 
     def save(self, file: Path) -> None:
         """All that is needed to go on exactly from here, written whole or not at all.

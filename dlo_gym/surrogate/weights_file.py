@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -78,12 +78,14 @@ class Weights(NamedTuple):
         scales: of its inputs and outputs.
         training: how it came about.
         conditioning: what makes it another rod's; None where it knows one kind of rod.
+        activation: between the layers: ReLU as in the paper, or SiLU.
     """
 
     layers: Layers
     scales: Scales
     training: dict[str, Any]
     conditioning: Conditioning | None = None
+    activation: Literal["relu", "silu"] = "relu"
 
     def for_rod(self, properties: RodProperties) -> "Weights":
         """The same network for one rod; itself where it knows but one kind of rod."""
@@ -101,7 +103,8 @@ class Weights(NamedTuple):
             blocks.append(folded)
         terms = guess_terms(self.conditioning.inputs(properties))
         guess = np.tensordot(terms, self.layers.guess, 1).astype(np.float32)
-        return Weights(Layers(*blocks, guess), self.scales.times(properties.length), self.training)
+        scales = self.scales.times(properties.length)
+        return Weights(Layers(*blocks, guess), scales, self.training, None, self.activation)
 
 
 def save_weights(file: Path, weights: Weights) -> None:
@@ -173,7 +176,7 @@ def load_weights(file: Path) -> Weights:
     conditioning = Conditioning(
         tensors["groups.low"], tensors["groups.high"], block("embedding", 2), modulation
     )
-    return Weights(layers, scales, training, conditioning)
+    return Weights(layers, scales, training, conditioning, "silu")
 
 
 def _expected_shapes(
@@ -192,8 +195,8 @@ def _expected_shapes(
     shapes: dict[str, tuple[int, ...]] = {"guess": (2 * ACTION_SIZE, size)}
     if many_rods:
         units = sum(sum(sizes[1:]) for sizes in widths.values())
-        width = len(_matrix(file, tensors, "embedding.0.weight"))
-        widths |= {"embedding": (N_GROUPS, width, width), "modulation": (width, 2 * units)}
+        first, second = (len(_matrix(file, tensors, f"embedding.{i}.weight")) for i in range(2))
+        widths |= {"embedding": (N_GROUPS, first, second), "modulation": (second, 2 * units)}
         shapes |= {"groups.low": (N_GROUPS,), "groups.high": (N_GROUPS,)}
         shapes["guess"] = (N_TERMS, *shapes["guess"])
     for block, sizes in widths.items():

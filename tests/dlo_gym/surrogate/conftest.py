@@ -31,7 +31,7 @@ def varied_rollouts(small_settings) -> Rollouts:
             youngs_modulus_max=1e7,
             poisson_ratio_min=0.0,
             rest_curvature_max=4.0,
-        )  # fmt: skip
+        )
     )
 
 
