@@ -7,8 +7,9 @@ how often it had to be begun anew, does not show in its result.
 import multiprocessing
 import os
 import signal
+import socket
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -18,6 +19,7 @@ from dlo_gym.exceptions import MissingExtra, WorkersLost
 
 ATTEMPTS = 3  # at a task whose worker dies
 LOOPBACK = "127.0.0.1"
+CONNECTION_TIMEOUT = 10.0  # [s]
 
 
 def run_tasks(
@@ -53,6 +55,17 @@ def run_tasks(
             yield index, function(*arguments)
     else:
         yield from _in_processes(function, tasks, n_processes)
+
+
+def in_order(results: Iterable[tuple[int, Any]]) -> Iterator[Any]:
+    """The results of ``run_tasks`` in the order of their tasks, each as soon as those before it."""
+    waiting: dict[int, Any] = {}
+    following = 0
+    for index, result in results:
+        waiting[index] = result
+        while following in waiting:
+            yield waiting.pop(following)
+            following += 1
 
 
 def _in_processes(
@@ -93,15 +106,11 @@ def _on_ray(
     settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
     if address == "local":
         settings |= {"num_cpus": n_processes, "include_dashboard": False}
+    else:
+        _check_reachable(address)
     if _is_loopback(address):
         settings["_node_ip_address"] = LOOPBACK
-    try:
-        ray.init(address, **settings)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        raise ValueError(
-            f"ray_address: expected the host:port of a running Ray cluster, or 'local', got"
-            f" {address!r}: {error}"
-        ) from error
+    ray.init(address, **settings)
     try:
         remote = ray.remote(max_retries=ATTEMPTS, num_cpus=1)(function)
         running = {remote.remote(*arguments): index for index, arguments in enumerate(tasks)}
@@ -138,6 +147,18 @@ def import_ray(address: str) -> Any:
     except ModuleNotFoundError as error:
         raise MissingExtra("ray", "scale") from error
     return ray
+
+
+def _check_reachable(address: str) -> None:
+    """Ray itself would try for minutes."""
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), CONNECTION_TIMEOUT).close()
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            "ray_address: expected the host:port of a running Ray cluster, or 'local', got"
+            f" {address!r}: {error}"
+        ) from error
 
 
 def _is_loopback(address: str) -> bool:

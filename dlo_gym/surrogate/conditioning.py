@@ -47,9 +47,9 @@ class Conditioning(NamedTuple):
         """(M,) each, of the units of all layers in order."""
         embedded = self.inputs(properties)
         for weight, bias in self.embedding:
-            embedded = np.maximum(weight @ embedded + bias, 0.0)
+            embedded = np.maximum(weight.astype(np.float64) @ embedded + bias, 0.0)
         weight, bias = self.modulation
-        gains, shifts = np.split(weight @ embedded + bias, 2)
+        gains, shifts = np.split(weight.astype(np.float64) @ embedded + bias, 2)
         return 1.0 + gains, shifts
 
 

@@ -48,8 +48,10 @@ class Moves(NamedTuple):
 
     def exchanged(self, which: Tensor) -> "Moves":
         """The moves, of some rods (B,) with the ends exchanged."""
-        ends = [torch.where(which[:, None, None], x.flip(1), x) for x in self[:4]]
-        return Moves(*ends, self.lengths, self.rods)
+        before, change, shift, turn = (
+            torch.where(which[:, None, None], values.flip(1), values) for values in self[:4]
+        )
+        return Moves(before, change, shift, turn, self.lengths, self.rods)
 
 
 class RolloutDataset:
@@ -90,7 +92,8 @@ class RolloutDataset:
         moves = moves.exchanged(torch.rand(size, generator=generator) < 0.5)
         batch = encode(moves, scales)
         mirrored = torch.rand(size, generator=generator) < 0.5
-        return Batch(*(_mirror_some(values, mirrored) for values in batch[:3]), batch.rods)
+        state, actions, change = (_mirror_some(values, mirrored) for values in batch[:3])
+        return Batch(state, actions, change, batch.rods)
 
     def moves(self, size: int, generator: torch.Generator) -> Moves:
         """Random moves from one state of a rollout to another."""

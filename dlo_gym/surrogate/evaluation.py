@@ -1,7 +1,8 @@
 """Scores of a shape predictor on rollouts it has not seen (Section VI-A2)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from rich.table import Table
@@ -37,6 +38,14 @@ class Score:
     motion_mm: float
 
 
+class RecordedMove(NamedTuple):
+    """Centerlines (n, 3) before and after [m], and the clamps' displacement between."""
+
+    before: Array
+    displacement: BoundaryDisplacement
+    after: Array
+
+
 def evaluate_predictor(
     predict_for: PredictFor,
     rollouts: Rollouts,
@@ -61,11 +70,12 @@ def evaluate_predictor(
     for steps in n_steps:
         errors, motions = [], []
         for i, predict in enumerate(predictors):
-            states = rollouts.positions[i].astype(np.float64)
-            errors.append(move_errors(predict, rollouts, i, steps, stride, noise, rng))
-            motion = ptp_3d(states[: len(states) - steps : stride], states[steps::stride])
-            motions.append(motion)
-        error = 1e3 * np.concatenate(errors)
+            for move in recorded_moves(rollouts, i, steps, stride):
+                offset = noise * rng.standard_normal(move.before.shape)
+                predicted = predict(move.before + offset, move.displacement) - offset
+                errors.append(ptp_3d(predicted, move.after))
+                motions.append(ptp_3d(move.before, move.after))
+        error = 1e3 * np.array(errors)
         mean = error.mean(axis=1)
         scores.append(
             Score(
@@ -74,32 +84,21 @@ def evaluate_predictor(
                 float(mean.mean()),
                 float(np.percentile(mean, 95)),
                 float(error.max()),
-                float(1e3 * np.concatenate(motions).mean()),
+                float(1e3 * np.mean(motions)),
             )
         )
     return scores
 
 
-def move_errors(
-    predict: Predict,
-    rollouts: Rollouts,
-    index: int,
-    steps: int,
-    stride: int = 1,
-    noise: float = 0.0,
-    rng: np.random.Generator | None = None,
-) -> Array:
-    """PTP3D (n_moves, n) of ``predict`` per node, for moves of ``steps`` in one rollout [m]."""
-    states = rollouts.positions[index].astype(np.float64)
-    boundaries = [boundary(x, c) for x, c in zip(states, rollouts.clamps[index], strict=True)]
-    errors = []
+def recorded_moves(
+    rollouts: Rollouts, index: int, steps: int, stride: int = 1
+) -> Iterator[RecordedMove]:
+    """The moves of ``steps`` in one rollout, from every ``stride``-th state."""
+    states, clamps = rollouts.positions[index].astype(np.float64), rollouts.clamps[index]
     for first in range(0, len(states) - steps, stride):
         last = first + steps
-        displacement = boundaries[first].displacement_to(boundaries[last])
-        offset = noise * rng.standard_normal(states[first].shape) if noise and rng else 0.0
-        predicted = predict(states[first] + offset, displacement) - offset
-        errors.append(ptp_3d(predicted, states[last]))
-    return np.array(errors)
+        start, end = boundary(states[first], clamps[first]), boundary(states[last], clamps[last])
+        yield RecordedMove(states[first], start.displacement_to(end), states[last])
 
 
 def boundary(positions: Array, clamps: Array) -> BoundaryPoses:

@@ -32,7 +32,7 @@ class DloNetwork(nn.Module):
         self.state = _layers(size, hidden, hidden, hidden, activation=activation)
         self.action = _layers(ACTION_SIZE, half, half, activation=activation)
         widths = (2 * hidden, hidden, hidden, hidden, size)
-        self.prediction = _layers(*widths, activation=activation)[:-1]
+        self.prediction = nn.Sequential(*list(_layers(*widths, activation=activation))[:-1])
 
     def forward(self, state: Tensor, actions: Tensor) -> Tensor:
         """The change (B, 3 n) of states (B, 3 n) under actions (B, 2, 7), in network units."""

@@ -45,15 +45,19 @@ class ShapePredictor:
         self.training = weights.training
         layers, self._scales, *_, activation = weights.for_rod(self.properties)
         self._activation = ACTIVATIONS[activation]
+        scale = self._activation.scale
         self._state, self._action, prediction = (
-            [(weight.astype(dtype), bias.astype(dtype)) for weight, bias in block]
-            for block in layers[:3]
+            [
+                ((scale * weight).astype(dtype), (scale * bias).astype(dtype))
+                for weight, bias in block
+            ]
+            for block in (layers.state, layers.action, layers.prediction[:-1])
         )
         hidden = len(layers.state[-1][1])
         first, self._bias = prediction[0]
         self._from_state = first[:, :hidden].copy()
         self._from_actions = [part.copy() for part in np.split(first[:, hidden:], 2, axis=1)]
-        self._inner, self._last = prediction[1:-1], prediction[-1][0]
+        self._inner, self._last = prediction[1:], layers.prediction[-1][0].astype(dtype)
         self._guess = np.ascontiguousarray(layers.guess.T, dtype)
         self._null = np.zeros((2, 7), dtype)
         self._null[:, 3] = 1.0
@@ -326,10 +330,12 @@ def _end_tangents(end: _End, dtwist: Array, dedge: Array | None) -> _EndTangents
 
 
 class _Activation(NamedTuple):
-    """Elementwise: the function alone, and with its derivative."""
+    """Elementwise: the function alone, and with its derivative; of ``scale`` times the sum that
+    enters a unit, which is multiplied into the weights beforehand."""
 
     value: Callable[[Float], Float]
     value_and_slope: Callable[[Float], tuple[Float, Float]]
+    scale: float
 
 
 def _relu(x: Float) -> Float:
@@ -341,21 +347,24 @@ def _relu_and_slope(x: Float) -> tuple[Float, Float]:
     return x * active, active
 
 
-def _silu(x: Float) -> Float:
-    half = 0.5 * x
-    return half + half * np.tanh(half)
+def _silu(half: Float) -> Float:
+    """x / (1 + exp(-x)) of x / 2."""
+    value = np.tanh(half)
+    value += 1.0
+    value *= half
+    return value
 
 
-def _silu_and_slope(x: Float) -> tuple[Float, Float]:
-    half = 0.5 * x
-    sigmoid = 0.5 + 0.5 * np.tanh(half)
-    value = x * sigmoid
-    return value, sigmoid + value * (1.0 - sigmoid)
+def _silu_and_slope(half: Float) -> tuple[Float, Float]:
+    doubled = np.tanh(half)  # the logistic function, twice
+    doubled += 1.0
+    value = half * doubled
+    return value, doubled + value * (2.0 - doubled)
 
 
 ACTIVATIONS = {
-    "relu": _Activation(_relu, _relu_and_slope),
-    "silu": _Activation(_silu, _silu_and_slope),
+    "relu": _Activation(_relu, _relu_and_slope, 1.0),
+    "silu": _Activation(_silu, _silu_and_slope, 0.5),
 }
 
 

@@ -85,7 +85,7 @@ def load_rollouts(folder: Path) -> tuple[Rollouts, Manifest]:
             f" {folder} --resume and the settings in its manifest.json"
         )
     shards = [_read_shard(folder / shard_name(i)) for i in range(manifest.settings.n_shards)]
-    return Rollouts(*(np.concatenate(parts) for parts in zip(*shards, strict=True))), manifest
+    return Rollouts.joined(shards), manifest
 
 
 def shard_name(shard: int) -> str:
@@ -112,8 +112,9 @@ def _sha256(file: Path) -> str:
 
 def simulate_shard(settings: RolloutSettings, shard: int) -> Rollouts:
     """The rollouts of a shard."""
-    made = [simulate_rollout(settings, index) for index in settings.shard_indices(shard)]
-    return Rollouts(*(np.concatenate(parts) for parts in zip(*made, strict=True)))
+    return Rollouts.joined(
+        simulate_rollout(settings, index) for index in settings.shard_indices(shard)
+    )
 
 
 def _write_shard(folder: Path, shard: int, arrays: Rollouts) -> str:

@@ -1,5 +1,6 @@
 """Random rollouts of a rod: a random settled state and random actions (Section VI-A1)."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -147,6 +148,15 @@ class Rollouts(NamedTuple):
     positions: Array32
     clamps: Array32
     rods: Array
+
+    @classmethod
+    def joined(cls, parts: Iterable["Rollouts"]) -> "Rollouts":
+        positions, clamps, rods = zip(*parts, strict=True)
+        return cls(np.concatenate(positions), np.concatenate(clamps), np.concatenate(rods))
+
+    def some(self, which: slice) -> "Rollouts":
+        """The rollouts ``which``."""
+        return Rollouts(self.positions[which], self.clamps[which], self.rods[which])
 
     @property
     def lengths(self) -> Array:

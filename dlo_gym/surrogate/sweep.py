@@ -26,8 +26,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from dlo_gym.atomic_file import written_aside
 from dlo_gym.exceptions import DatasetError
 from dlo_gym.executor import run_tasks
+from dlo_gym.metrics import ptp_3d
 from dlo_gym.output_folder import check_output_folder
-from dlo_gym.surrogate.evaluation import move_errors
+from dlo_gym.surrogate.evaluation import recorded_moves
 from dlo_gym.surrogate.predictor import ShapePredictor
 from dlo_gym.surrogate.simulation import RolloutSettings, simulate_rollout
 from dlo_gym.surrogate.weights_file import SHIPPED, SHIPPED_ONE_ROD, load_weights
@@ -59,7 +60,7 @@ class SweepSettings:
     n_steps: tuple[int, ...] = (1, 2, 3, 4)
     n_rollouts: int = 500
     seed: int = 3000
-    stride: int = 5
+    stride: int = 10
     chunk: int = 25
 
     def __post_init__(self) -> None:
@@ -81,9 +82,13 @@ class SweepSettings:
 
     @property
     def parts(self) -> list["Part"]:
+        """The first rollouts of every rod, then the next."""
         starts = range(0, self.n_rollouts, self.chunk)
-        return [Part(*rod, first, min(first + self.chunk, self.n_rollouts))
-                for rod in self.rods for first in starts]  # fmt: skip
+        return [
+            Part(*rod, first, min(first + self.chunk, self.n_rollouts))
+            for first in starts
+            for rod in self.rods
+        ]
 
     def rollouts(self, youngs_modulus: float, radius: float) -> RolloutSettings:
         return replace(
@@ -111,11 +116,12 @@ def part_errors(settings: SweepSettings, part: Part, files: tuple[Path, ...]) ->
     errors = np.full(shape, np.nan, np.float32)
     for row, index in enumerate(range(part.first, part.last)):
         made = simulate_rollout(rollouts, index)
-        for i, network in enumerate(networks):
-            predict = ShapePredictor(network, made.properties(0)).predict
-            for j, steps in enumerate(settings.n_steps):
-                moves = move_errors(predict, made, 0, steps, stride=settings.stride)
-                errors[i, j, row, : len(moves)] = 1e3 * moves.mean(axis=1)
+        predictors = [ShapePredictor(network, made.properties(0)) for network in networks]
+        for j, steps in enumerate(settings.n_steps):
+            for k, move in enumerate(recorded_moves(made, 0, steps, settings.stride)):
+                for i, predictor in enumerate(predictors):
+                    predicted = predictor.predict(move.before, move.displacement)
+                    errors[i, j, row, k] = 1e3 * ptp_3d(predicted, move.after).mean()
     return errors
 
 
@@ -218,9 +224,9 @@ def _open_sweep(out: Path, description: dict[str, Any], *, resume: bool, overwri
 
 def _cells(out: Path, settings: SweepSettings, names: list[str]) -> Iterator[dict[str, Any]]:
     """Scores of every rod, network and number of steps."""
-    per_rod = len(settings.parts) // len(settings.rods)
+    n_parts, n_rods = len(settings.parts), len(settings.rods)
     for i, (modulus, radius) in enumerate(settings.rods):
-        files = [_part_file(out, k) for k in range(i * per_rod, (i + 1) * per_rod)]
+        files = [_part_file(out, k) for k in range(i, n_parts, n_rods)]
         errors = np.concatenate([np.load(file, allow_pickle=False) for file in files], axis=2)
         for j, steps in enumerate(settings.n_steps):
             for name, values in zip(names, errors[:, j], strict=True):

@@ -94,9 +94,9 @@ class Trainer:
         self.settings = settings
         self.scales = Scales()
         self.data = RolloutDataset(
-            Rollouts(*(x[:cut] for x in rollouts)), noise=settings.noise, plain=settings.plain
+            rollouts.some(slice(cut)), noise=settings.noise, plain=settings.plain
         )
-        self.held_back = Rollouts(*(x[cut:] for x in rollouts))
+        self.held_back = rollouts.some(slice(cut, None))
         held_back = RolloutDataset(self.held_back, plain=settings.plain)
         generator = torch.Generator().manual_seed(1)
         self.validation = self._batch(held_back, VALIDATION_SIZE, generator)

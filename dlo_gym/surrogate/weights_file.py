@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, dataclass
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -92,19 +93,22 @@ class Weights(NamedTuple):
         if self.conditioning is None:
             return self
         gains, shifts = self.conditioning.gains_and_shifts(properties)
-        blocks, first = [], 0
-        for block in self.layers[:3]:
-            folded = []
-            for weight, bias in block:
-                units = slice(first, first := first + len(bias))
-                gain = gains[units]
-                pair = (gain[:, None] * weight, gain * bias + shifts[units])
-                folded.append(tuple(np.asarray(values, np.float32) for values in pair))
-            blocks.append(folded)
+        folded, first = [], 0
+        for weight, bias in chain(*self.layers[:3]):
+            units = slice(first, first := first + len(bias))
+            gain = gains[units]
+            shifted = gain * bias + shifts[units]
+            folded.append(
+                (np.asarray(gain[:, None] * weight, np.float32), np.asarray(shifted, np.float32))
+            )
+        rest = iter(folded)
+        state, action, prediction = (list(islice(rest, depth)) for depth in DEPTHS.values())
         terms = guess_terms(self.conditioning.inputs(properties))
         guess = np.tensordot(terms, self.layers.guess, 1).astype(np.float32)
         scales = self.scales.times(properties.length)
-        return Weights(Layers(*blocks, guess), scales, self.training, None, self.activation)
+        return Weights(
+            Layers(state, action, prediction, guess), scales, self.training, None, self.activation
+        )
 
 
 def save_weights(file: Path, weights: Weights) -> None:
@@ -169,7 +173,8 @@ def load_weights(file: Path) -> Weights:
     def block(name: str, depth: int) -> list[Layer]:
         return [(tensors[f"{name}.{i}.weight"], tensors[f"{name}.{i}.bias"]) for i in range(depth)]
 
-    layers = Layers(*(block(name, depth) for name, depth in DEPTHS.items()), tensors["guess"])
+    state, action, prediction = (block(name, depth) for name, depth in DEPTHS.items())
+    layers = Layers(state, action, prediction, tensors["guess"])
     if not many_rods:
         return Weights(layers, scales, training)
     (modulation,) = block("modulation", 1)

@@ -113,11 +113,10 @@ def test_ends_above_each_other_are_no_trouble(weights):
     assert_allclose(got, expected, atol=2e-7)
 
 
-# With other seeds IPOPT may stall on one of the network's many kinks.
-@pytest.mark.parametrize("seed", [3, 5])
+@pytest.mark.parametrize("seed", range(3, 6))
 def test_the_mpc_on_the_network_agrees_with_ipopt(seed):
     rng = np.random.default_rng(seed)
-    weights = random_weights(seed)
+    weights = random_weights(seed)._replace(activation="silu")  # IPOPT may stall on ReLU's kinks
     predictor = ShapePredictor(weights)
     line = random_arc(rng)
     boundary = BoundaryPoses(

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dlo_gym.exceptions import DatasetError, MissingExtra, WorkersLost
-from dlo_gym.executor import ATTEMPTS, run_tasks
+from dlo_gym.executor import ATTEMPTS, import_ray, in_order, run_tasks
 
 
 def squared(value: int) -> tuple[int, int]:
@@ -40,6 +40,14 @@ def test_every_task_is_done_once_and_named_by_its_index(workers):
     assert {index: square for index, (square, _) in found.items()} == {i: i**2 for i in range(9)}
     processes = {process for _, process in found.values()}
     assert (processes == {os.getpid()}) == (workers == 1)
+
+
+def test_results_in_the_order_of_their_tasks():
+    came = iter([(2, "c"), (0, "a"), (1, "b"), (4, "e"), (3, "d")])
+    ordered = in_order(came)
+    assert next(ordered) == "a"
+    assert next(came) == (1, "b")  # not read further than needed
+    assert list(in_order([(2, "c"), (0, "a"), (1, "b")])) == ["a", "b", "c"]
 
 
 def test_no_tasks():
@@ -84,17 +92,29 @@ def test_ray_that_is_not_installed_is_named(monkeypatch):
         list(run_tasks(squared, [(1,)], ray_address="local"))
 
 
+def import_ray_or_skip() -> None:
+    """Before anything else imports Ray, so that it keeps to loopback."""
+    try:
+        import_ray("local")
+    except MissingExtra as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "127.0.0.1", "nowhere:much"])
+def test_an_address_without_a_cluster_is_refused(address):
+    import_ray_or_skip()
+    with pytest.raises(ValueError, match=f"ray_address: expected the host:port .* {address!r}"):
+        list(run_tasks(squared, [(1,)], ray_address=address))
+
+
 RAY_START = 200  # seconds a Ray node may take to start on a busy machine
 
 
 @pytest.fixture
 def ray_cluster(monkeypatch):
     """Two nodes of one worker each, on loopback alone; (address, the second node, cluster)."""
-    pytest.importorskip("ray")
     monkeypatch.setenv("RAY_raylet_start_wait_time_s", str(RAY_START))
-    from dlo_gym.executor import import_ray
-
-    import_ray("local")
+    import_ray_or_skip()
     from ray.cluster_utils import Cluster
 
     node = {"num_cpus": 1, "node_ip_address": "127.0.0.1"}
@@ -160,9 +180,10 @@ class TestRay:
     def test_ray_starts_and_stops_by_itself_on_loopback(self, monkeypatch):
         psutil = pytest.importorskip("psutil")
         monkeypatch.setenv("RAY_raylet_start_wait_time_s", str(RAY_START))
+        others = psutil.Process().children(recursive=True)
         tasks = run_tasks(slow_square, [(i,) for i in range(4)], workers=2, ray_address="local")
         found = [next(tasks)]
-        children = psutil.Process().children(recursive=True)
+        children = [p for p in psutil.Process().children(recursive=True) if p not in others]
         listening = [
             connection.laddr.ip.removeprefix("::ffff:")
             for process in children
@@ -175,7 +196,3 @@ class TestRay:
         assert sorted(index for index, _ in found) == list(range(4))
         _, alive = psutil.wait_procs(children, timeout=60)
         assert alive == []
-
-    def test_an_address_without_a_cluster_is_refused(self):
-        with pytest.raises(ValueError, match="ray_address: expected the host:port"):
-            list(run_tasks(squared, [(1,)], ray_address="127.0.0.1:1"))

@@ -1,6 +1,5 @@
 import dataclasses
 
-import numpy as np
 import pytest
 
 from dlo_gym.surrogate.simulation import Rollouts, RolloutSettings, simulate_rollout
@@ -36,5 +35,4 @@ def varied_rollouts(small_settings) -> Rollouts:
 
 
 def simulate_all(settings: RolloutSettings) -> Rollouts:
-    made = [simulate_rollout(settings, i) for i in range(settings.n_rollouts)]
-    return Rollouts(*(np.concatenate(parts) for parts in zip(*made, strict=True)))
+    return Rollouts.joined(simulate_rollout(settings, i) for i in range(settings.n_rollouts))

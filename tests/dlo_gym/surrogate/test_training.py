@@ -45,8 +45,7 @@ def data(tmp_path_factory, small_settings):
 
 
 def simulate_all(settings: RolloutSettings) -> Rollouts:
-    made = [simulate_rollout(settings, i) for i in range(settings.n_rollouts)]
-    return Rollouts(*(np.concatenate(parts) for parts in zip(*made, strict=True)))
+    return Rollouts.joined(simulate_rollout(settings, i) for i in range(settings.n_rollouts))
 
 
 @pytest.fixture(autouse=True)
@@ -294,7 +293,7 @@ class TestTraining:
 
     def test_one_rollout_is_not_enough(self, small_rollouts):
         with pytest.raises(DatasetError, match="at least 2 rollouts"):
-            Trainer(type(small_rollouts)(*(x[:1] for x in small_rollouts)), SHORT)
+            Trainer(small_rollouts.some(slice(1)), SHORT)
 
     def test_default_settings_are_the_paper_s(self):
         s, r = TrainingSettings(), RolloutSettings()
