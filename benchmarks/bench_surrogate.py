@@ -10,6 +10,7 @@ from rich.table import Table
 from dlo_gym.rod import BoundaryDisplacement, CosseratRod, RodProperties
 from dlo_gym.rod.initial_shapes import random_boundary
 from dlo_gym.surrogate.predictor import ShapePredictor
+from dlo_gym.surrogate.weights_file import SHIPPED_ONE_ROD
 
 STEP = np.tile([0.005] * 3 + [np.deg2rad(2.25)] * 3, 2)
 
@@ -31,7 +32,8 @@ def main() -> None:
     rod = CosseratRod(RodProperties(length=0.5))
     start = rod.settle(random_boundary(rng, 0.5))
     displacement = BoundaryDisplacement.from_vector(STEP * rng.choice([-1.0, 1.0], 12))
-    predictor = ShapePredictor.load()
+    predictor = ShapePredictor.load(properties=rod.properties)
+    reference = ShapePredictor.load(SHIPPED_ONE_ROD)
     centerline = start.positions
 
     def move() -> None:
@@ -48,6 +50,12 @@ def main() -> None:
         (
             "surrogate: prediction and Jacobian",
             lambda: predictor.predict_with_jacobian(centerline, displacement),
+        ),
+        ("surrogate: for another rod", lambda: predictor.for_rod(rod.properties)),
+        ("reference rod only: prediction", lambda: reference.predict(centerline, displacement)),
+        (
+            "reference rod only: prediction and Jacobian",
+            lambda: reference.predict_with_jacobian(centerline, displacement),
         ),
         ("rod: restore and move", move),
         ("rod: restore, move and sensitivity", move_and_differentiate),

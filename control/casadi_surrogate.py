@@ -4,13 +4,20 @@ The controller itself plans on ``ShapePredictor``, which is about ten times fast
 tangents; this is the same map for ``mpc_reference`` and for users of CasADi.
 """
 
+from collections.abc import Callable
 from math import factorial
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from dlo_gym.surrogate.weights_file import Layer, Scales, Weights
+from dlo_gym.surrogate.weights_file import Layer, Layers, Scales, Weights
+
+Activation = Callable[[ca.MX], ca.MX]
+ACTIVATIONS: dict[str, Activation] = {
+    "relu": lambda x: ca.fmax(x, 0.0),
+    "silu": lambda x: 0.5 * x * (1.0 + ca.tanh(0.5 * x)),
+}
 
 # Of the series of Rodrigues' coefficients: below 1e-9 up to 2 rad.
 SERIES_TERMS = 10
@@ -23,8 +30,14 @@ def casadi_step(weights: Weights) -> ca.Function:
         a function ``(centerline, displacement) -> next_centerline``: (3 n_nodes,) node by node
         [m]; (12,) left then right, translation [m] and rotation vector [rad] of up to 2 rad, world
         axes; (3 n_nodes,) [m].
+
+    Raises:
+        ValueError: if the weights are of a network for many rods.
     """
+    if weights.conditioning is not None:
+        raise ValueError("weights: expected those of one rod; take weights.for_rod(properties)")
     layers, scales = weights.layers, weights.scales
+    activation = ACTIVATIONS[weights.activation]
     n = len(layers.prediction[-1][1]) // 3
     flat, displacement = ca.MX.sym("centerline", 3 * n), ca.MX.sym("displacement", 12)
     x = ca.reshape(flat, 3, n)
@@ -34,10 +47,12 @@ def casadi_step(weights: Weights) -> ca.Function:
     left = _end(seen[:, 0], seen[:, 1], twists[:, 0], twists[:, 1], 1.0, scales)
     right = _end(seen[:, n - 1], seen[:, n - 2], twists[:, 2], twists[:, 3], -1.0, scales)
 
-    state = _forward(layers.state, ca.vec(seen) / scales.position)
-    moved = _prediction(layers.prediction, layers.action, state, left.features, right.features)
+    state = _forward(layers.state, ca.vec(seen) / scales.position, activation)
     null = ca.MX(ca.DM([0, 0, 0, 1, 0, 0, 0]))
-    still = _prediction(layers.prediction, layers.action, state, null, null)
+    moved, still = (
+        _prediction(layers, state, actions, activation)
+        for actions in ((left.features, right.features), (null, null))
+    )
     offset = ca.vertcat(left.features - null, right.features - null)
     change = scales.change * (moved - still + _dm(layers.guess.T) @ offset)
     inner = ca.reshape(change, 3, n)[:, 2 : n - 2]
@@ -89,17 +104,18 @@ def _rotated(vector: ca.MX, turn: ca.MX) -> ca.MX:
 
 
 def _prediction(
-    prediction: list[Layer], action: list[Layer], state: ca.MX, left: ca.MX, right: ca.MX
+    layers: Layers, state: ca.MX, actions: tuple[ca.MX, ca.MX], activation: Activation
 ) -> ca.MX:
     """The prediction block on the embedded state and actions; its last layer is linear."""
-    embedded = ca.vertcat(state, _forward(action, left), _forward(action, right))
-    weight, bias = prediction[-1]
-    return _dm(weight) @ _forward(prediction[:-1], embedded) + _dm(bias)
+    embedded = [_forward(layers.action, action, activation) for action in actions]
+    weight, bias = layers.prediction[-1]
+    inner = _forward(layers.prediction[:-1], ca.vertcat(state, *embedded), activation)
+    return _dm(weight) @ inner + _dm(bias)
 
 
-def _forward(layers: list[Layer], value: ca.MX) -> ca.MX:
+def _forward(layers: list[Layer], value: ca.MX, activation: Activation) -> ca.MX:
     for weight, bias in layers:
-        value = ca.fmax(_dm(weight) @ value + _dm(bias), 0.0)
+        value = activation(_dm(weight) @ value + _dm(bias))
     return value
 
 

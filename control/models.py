@@ -61,6 +61,8 @@ class Predictor(Protocol):
     @property
     def n_nodes(self) -> int: ...
 
+    def for_rod(self, properties: RodProperties) -> "Predictor": ...
+
     def predict(
         self,
         centerline: Array,
@@ -88,7 +90,8 @@ class SurrogateModel:
         return self.predictor.n_nodes
 
     def reset(self, boundary: BoundaryPoses, properties: RodProperties) -> None:
-        """Nothing to start: the predictor knows the rod from its centerline alone."""
+        """Takes the predictor for this rod; the clamps it knows from the centerline."""
+        self.predictor = self.predictor.for_rod(properties)
 
     def step(
         self, centerline: Array, boundary: BoundaryPoses, displacement: BoundaryDisplacement

@@ -17,6 +17,10 @@ COMMANDS = {
     "track": ("tracking.evaluate:track", "track the cable in a recording and report"),
     "rollouts": ("dlo_gym.surrogate.rollouts:rollouts", "simulate rod rollouts for training"),
     "train-surrogate": ("dlo_gym.surrogate.train:train_surrogate", "train the shape predictor"),
+    "evaluate-surrogate": (
+        "dlo_gym.surrogate.sweep:evaluate_surrogate",
+        "score shape predictors on rods of other stiffness",
+    ),
     "train-rl": ("control.rl:train_rl", "train a policy with SAC and HER"),
     "robot init": ("sim2real.templates:init", "write a cell file to start from"),
     "robot check": ("sim2real.check:check", "connect to a cell, check every part, move nothing"),

@@ -39,6 +39,10 @@ class DatasetError(DloError):
     """A dataset folder or one of its shards is incomplete or damaged; names the file."""
 
 
+class WorkersLost(DloError):
+    """Processes that worked at a task died again and again."""
+
+
 class TrackLost(DloError):
     """The tracker has not seen the rod for longer than it was allowed to."""
 

@@ -103,7 +103,7 @@ def make_predictor(name: str, properties: RodProperties, n_nodes: int = 51) -> P
         return RodPredictor(properties, n_nodes)
     from dlo_gym.surrogate.predictor import ShapePredictor
 
-    network = ShapePredictor.load()
+    network = ShapePredictor.load(properties=properties)
     if network.n_nodes != n_nodes:
         raise ValueError(
             f"predictor: the network was trained for {network.n_nodes} nodes, got a rod of"

@@ -2,9 +2,11 @@
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from dlo_gym.surrogate.conditioning import groups
 from dlo_gym.surrogate.simulation import Rollouts
 from dlo_gym.surrogate.weights_file import Scales
 
@@ -16,11 +18,13 @@ class Batch(NamedTuple):
         state: (B, 3 n) centerlines, mean-centred.
         actions: (B, 2, 7) of the clamps.
         change: (B, 3 n) of the centerlines.
+        rods: (B, 4) groups of the rods.
     """
 
     state: Tensor
     actions: Tensor
     change: Tensor
+    rods: Tensor
 
 
 class Moves(NamedTuple):
@@ -31,12 +35,23 @@ class Moves(NamedTuple):
         change: (B, n, 3) of the centerlines [m].
         shift: (B, 2, 3) translations of the clamps [m].
         turn: (B, 2, 4) rotations of the clamps, wxyz with w >= 0.
+        lengths: (B,) of the rods [m].
+        rods: (B, 4) their groups.
     """
 
     before: Tensor
     change: Tensor
     shift: Tensor
     turn: Tensor
+    lengths: Tensor
+    rods: Tensor
+
+    def exchanged(self, which: Tensor) -> "Moves":
+        """The moves, of some rods (B,) with the ends exchanged."""
+        before, change, shift, turn = (
+            torch.where(which[:, None, None], values.flip(1), values) for values in self[:4]
+        )
+        return Moves(before, change, shift, turn, self.lengths, self.rods)
 
 
 class RolloutDataset:
@@ -57,6 +72,9 @@ class RolloutDataset:
     ) -> None:
         self.positions = torch.from_numpy(rollouts.positions)
         self.clamps = torch.from_numpy(rollouts.clamps)
+        self.lengths = torch.from_numpy(rollouts.lengths).float()
+        known = [groups(rollouts.properties(i)) for i in range(len(rollouts.rods))]
+        self.rods = torch.from_numpy(np.array(known)).float()
         self.max_steps, self.noise, self.plain = max_steps, noise, plain
 
     def __len__(self) -> int:
@@ -71,11 +89,11 @@ class RolloutDataset:
             moves = moves._replace(before=moves.before + noise)
         if self.plain:
             return encode_plain(moves)
-        exchanged = torch.rand(size, 1, 1, generator=generator) < 0.5
-        moves = Moves(*(torch.where(exchanged, values.flip(1), values) for values in moves))
+        moves = moves.exchanged(torch.rand(size, generator=generator) < 0.5)
         batch = encode(moves, scales)
         mirrored = torch.rand(size, generator=generator) < 0.5
-        return Batch(*(_mirror_some(values, mirrored) for values in batch))
+        state, actions, change = (_mirror_some(values, mirrored) for values in batch[:3])
+        return Batch(state, actions, change, batch.rods)
 
     def moves(self, size: int, generator: torch.Generator) -> Moves:
         """Random moves from one state of a rollout to another."""
@@ -91,16 +109,19 @@ class RolloutDataset:
             first, last = torch.where(back, last, first), torch.where(back, first, last)
         before, after = self.positions[rollout, first], self.positions[rollout, last]
         turn = relative_quaternion(self.clamps[rollout, first], self.clamps[rollout, last])
-        return Moves(before, after - before, (after - before)[:, [0, -1]], turn)
+        change = after - before
+        return Moves(
+            before, change, change[:, [0, -1]], turn, self.lengths[rollout], self.rods[rollout]
+        )
 
 
 def encode(moves: Moves, scales: Scales) -> Batch:
-    """Network units, seen along the heading.
+    """Network units, in rod lengths and seen along the heading.
 
     An action's seven numbers are the translation, and the cosine and the change of the clamp's
     tangent d3: the quaternion's part that matters, since no action turns the rod about its axis.
     """
-    axes = heading(moves.before)
+    axes, lengths = heading(moves.before), moves.lengths[:, None, None]
     d3 = torch.stack(
         [moves.before[:, 1] - moves.before[:, 0], moves.before[:, -1] - moves.before[:, -2]], 1
     )
@@ -108,13 +129,16 @@ def encode(moves: Moves, scales: Scales) -> Batch:
     turned = rotate(moves.turn, d3)
     cosine = (d3 * turned).sum(-1, keepdim=True)
     actions = [
-        moves.shift @ axes / scales.translation, cosine, (turned - d3) @ axes / scales.turn
+        moves.shift @ axes / (scales.translation * lengths),
+        cosine,
+        (turned - d3) @ axes / scales.turn,
     ]  # fmt: skip
     centred = moves.before - moves.before.mean(1, keepdim=True)
     return Batch(
-        (centred @ axes / scales.position).flatten(1),
+        (centred @ axes / (scales.position * lengths)).flatten(1),
         torch.cat(actions, -1),
-        (moves.change @ axes / scales.change).flatten(1),
+        (moves.change @ axes / (scales.change * lengths)).flatten(1),
+        moves.rods,
     )
 
 
@@ -122,7 +146,7 @@ def encode_plain(moves: Moves) -> Batch:
     """The paper's: metres and quaternions in world axes, mean-centred."""
     centred = moves.before - moves.before.mean(1, keepdim=True)
     actions = torch.cat([moves.shift, moves.turn], -1)
-    return Batch(centred.flatten(1), actions, moves.change.flatten(1))
+    return Batch(centred.flatten(1), actions, moves.change.flatten(1), moves.rods)
 
 
 def heading(centerlines: Tensor) -> Tensor:

@@ -1,7 +1,8 @@
 """Scores of a shape predictor on rollouts it has not seen (Section VI-A2)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from rich.table import Table
@@ -9,9 +10,11 @@ from rich.table import Table
 from dlo_gym.geometry.se3 import Array, pose, quaternion_to_matrix
 from dlo_gym.metrics import ptp_3d
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
+from dlo_gym.rod.properties import RodProperties
 from dlo_gym.surrogate.simulation import Rollouts
 
 Predict = Callable[[Array, BoundaryDisplacement], Array]
+PredictFor = Callable[[RodProperties], Predict]
 
 
 @dataclass(frozen=True)
@@ -35,8 +38,16 @@ class Score:
     motion_mm: float
 
 
+class RecordedMove(NamedTuple):
+    """Centerlines (n, 3) before and after [m], and the clamps' displacement between."""
+
+    before: Array
+    displacement: BoundaryDisplacement
+    after: Array
+
+
 def evaluate_predictor(
-    predict: Predict,
+    predict_for: PredictFor,
     rollouts: Rollouts,
     *,
     n_steps: tuple[int, ...] = (0, 1, 2, 3),
@@ -47,25 +58,23 @@ def evaluate_predictor(
     """Scores for moves of each of ``n_steps``, from every ``stride``-th state of the rollouts.
 
     Args:
-        predict: the centerline (n, 3) after a displacement.
+        predict_for: from a rod's properties, its ``predict``: the centerline (n, 3) after a
+            displacement.
         noise: standard deviation added to the coordinates that ``predict`` is given [m]; the error
             is then that of the predicted change.
         seed: of the noise.
     """
     rng = np.random.default_rng(seed)
+    predictors = [predict_for(rollouts.properties(i)) for i in range(len(rollouts.rods))]
     scores = []
     for steps in n_steps:
         errors, motions = [], []
-        for positions, clamps in zip(rollouts.positions, rollouts.clamps, strict=True):
-            states = positions.astype(np.float64)
-            boundaries = [boundary(x, c) for x, c in zip(states, clamps, strict=True)]
-            for first in range(0, len(states) - steps, stride):
-                last = first + steps
-                displacement = boundaries[first].displacement_to(boundaries[last])
-                offset = noise * rng.standard_normal(states[first].shape)
-                predicted = predict(states[first] + offset, displacement) - offset
-                errors.append(ptp_3d(predicted, states[last]))
-                motions.append(ptp_3d(states[first], states[last]))
+        for i, predict in enumerate(predictors):
+            for move in recorded_moves(rollouts, i, steps, stride):
+                offset = noise * rng.standard_normal(move.before.shape)
+                predicted = predict(move.before + offset, move.displacement) - offset
+                errors.append(ptp_3d(predicted, move.after))
+                motions.append(ptp_3d(move.before, move.after))
         error = 1e3 * np.array(errors)
         mean = error.mean(axis=1)
         scores.append(
@@ -79,6 +88,17 @@ def evaluate_predictor(
             )
         )
     return scores
+
+
+def recorded_moves(
+    rollouts: Rollouts, index: int, steps: int, stride: int = 1
+) -> Iterator[RecordedMove]:
+    """The moves of ``steps`` in one rollout, from every ``stride``-th state."""
+    states, clamps = rollouts.positions[index].astype(np.float64), rollouts.clamps[index]
+    for first in range(0, len(states) - steps, stride):
+        last = first + steps
+        start, end = boundary(states[first], clamps[first]), boundary(states[last], clamps[last])
+        yield RecordedMove(states[first], start.displacement_to(end), states[last])
 
 
 def boundary(positions: Array, clamps: Array) -> BoundaryPoses:

@@ -1,5 +1,6 @@
 """The rod's surrogate at run time: NumPy in, NumPy out, with exact derivatives."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -8,6 +9,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
+from dlo_gym.rod.properties import RodProperties
 from dlo_gym.surrogate.weights_file import SHIPPED, Weights, load_weights
 
 Float = NDArray[Any]  # of the network's dtype
@@ -21,41 +23,64 @@ class ShapePredictor:
 
     Around the paper's network (Section IV-B1) stand what is known without learning: the rod's
     behaviour does not depend on its place and heading, a null action moves nothing, the first and
-    last elements follow their clamps. Rotation about the rod's own axis is without effect.
+    last elements follow their clamps, and what the rod is made of matters by dimensionless groups
+    alone. Rotation about the rod's own axis is without effect.
 
     Derivatives are hand-written forward-mode tangents.
 
     Args:
         weights: as loaded by ``load_weights``.
+        properties: of the rod; the paper's rod of 0.5 m when omitted.
         dtype: of the network's arithmetic; all else is float64.
     """
 
-    def __init__(self, weights: Weights, dtype: DTypeLike = np.float32) -> None:
-        layers, self._scales = weights.layers, weights.scales
+    def __init__(
+        self,
+        weights: Weights,
+        properties: RodProperties | None = None,
+        dtype: DTypeLike = np.float32,
+    ) -> None:
+        self._weights, self._dtype = weights, np.dtype(dtype)
+        self.properties = RodProperties(length=0.5) if properties is None else properties
         self.training = weights.training
-        self._dtype = np.dtype(dtype)
+        layers, self._scales, *_, activation = weights.for_rod(self.properties)
+        self._activation = ACTIVATIONS[activation]
+        scale = self._activation.scale
         self._state, self._action, prediction = (
-            [(weight.astype(dtype), bias.astype(dtype)) for weight, bias in block]
-            for block in layers[:3]
+            [
+                ((scale * weight).astype(dtype), (scale * bias).astype(dtype))
+                for weight, bias in block
+            ]
+            for block in (layers.state, layers.action, layers.prediction[:-1])
         )
         hidden = len(layers.state[-1][1])
         first, self._bias = prediction[0]
         self._from_state = first[:, :hidden].copy()
         self._from_actions = [part.copy() for part in np.split(first[:, hidden:], 2, axis=1)]
-        self._inner, self._last = prediction[1:-1], prediction[-1][0]
+        self._inner, self._last = prediction[1:], layers.prediction[-1][0].astype(dtype)
         self._guess = np.ascontiguousarray(layers.guess.T, dtype)
         self._null = np.zeros((2, 7), dtype)
         self._null[:, 3] = 1.0
         self._still, _ = self._actions(self._null, None)
 
     @classmethod
-    def load(cls, path: Path | None = None) -> "ShapePredictor":
+    def load(
+        cls, path: Path | None = None, properties: RodProperties | None = None
+    ) -> "ShapePredictor":
         """From a file of ``dlo train-surrogate``; the shipped weights by default.
 
         Raises:
             WeightsError: if the file is missing, damaged or of another version.
         """
-        return cls(load_weights(SHIPPED if path is None else Path(path)))
+        return cls(load_weights(SHIPPED if path is None else Path(path)), properties)
+
+    def for_rod(self, properties: RodProperties) -> "ShapePredictor":
+        """The same network for another rod.
+
+        Rods beyond those of its training are taken for the nearest of them, of one that is not
+        uniform its means (see ``conditioning.groups``).
+        """
+        return ShapePredictor(self._weights, properties, self._dtype)
 
     @property
     def n_nodes(self) -> int:
@@ -199,10 +224,10 @@ class ShapePredictor:
         """The change (n, 3) and its tangents (n, 3, k): guess(A) + f(S, A) - f(S, 0)."""
         state, dstate = (x / self._scales.position).astype(self._dtype).ravel(), None
         if dx is None:
-            state = self._from_state @ _forward(self._state, state)
+            state = self._from_state @ _forward(self._state, state, self._activation)
         else:
             dstate = (dx / self._scales.position).astype(self._dtype).reshape(len(state), -1)
-            state, dstate = _forward_tangents(self._state, state, dstate)
+            state, dstate = _forward_tangents(self._state, state, dstate, self._activation)
             state, dstate = self._from_state @ state, self._from_state @ dstate
         moved, dmoved = self._actions(actions, dactions)
         if dmoved is not None and dstate is not None:
@@ -223,9 +248,11 @@ class ShapePredictor:
         value, tangents = self._bias, None
         for i, block in enumerate(self._from_actions):
             if dactions is None:
-                value = value + block @ _forward(self._action, actions[i])
+                value = value + block @ _forward(self._action, actions[i], self._activation)
                 continue
-            embedded, dembedded = _forward_tangents(self._action, actions[i], dactions[i])
+            embedded, dembedded = _forward_tangents(
+                self._action, actions[i], dactions[i], self._activation
+            )
             value = value + block @ embedded
             tangents = block @ dembedded if tangents is None else tangents + block @ dembedded
         return value, tangents
@@ -236,12 +263,11 @@ class ShapePredictor:
         return self._scales.change * change.astype(np.float64)
 
     def _inner_layers(self, value: Float, tangents: Float | None) -> tuple[Float, Float | None]:
-        """From the sum that enters the prediction block's first ReLU to its last ReLU."""
-        active = value > 0
-        value = value * active
+        """From the sum that enters the prediction block's first activation to its last one."""
         if tangents is None:
-            return _forward(self._inner, value), None
-        return _forward_tangents(self._inner, value, tangents * active[:, None])
+            return _forward(self._inner, self._activation.value(value), self._activation), None
+        value, slope = self._activation.value_and_slope(value)
+        return _forward_tangents(self._inner, value, tangents * slope[:, None], self._activation)
 
 
 class _End(NamedTuple):
@@ -303,19 +329,58 @@ def _end_tangents(end: _End, dtwist: Array, dedge: Array | None) -> _EndTangents
     )
 
 
-def _forward(layers: list[Layer], value: Float) -> Float:
-    for weight, bias in layers:
-        value = np.maximum(weight @ value + bias, 0.0)
+class _Activation(NamedTuple):
+    """Elementwise: the function alone, and with its derivative; of ``scale`` times the sum that
+    enters a unit, which is multiplied into the weights beforehand."""
+
+    value: Callable[[Float], Float]
+    value_and_slope: Callable[[Float], tuple[Float, Float]]
+    scale: float
+
+
+def _relu(x: Float) -> Float:
+    return np.maximum(x, 0.0)
+
+
+def _relu_and_slope(x: Float) -> tuple[Float, Float]:
+    active = x > 0
+    return x * active, active
+
+
+def _silu(half: Float) -> Float:
+    """x / (1 + exp(-x)) of x / 2."""
+    value = np.tanh(half)
+    value += 1.0
+    value *= half
     return value
 
 
-def _forward_tangents(layers: list[Layer], value: Float, tangents: Float) -> tuple[Float, Float]:
+def _silu_and_slope(half: Float) -> tuple[Float, Float]:
+    doubled = np.tanh(half)  # the logistic function, twice
+    doubled += 1.0
+    value = half * doubled
+    return value, doubled + value * (2.0 - doubled)
+
+
+ACTIVATIONS = {
+    "relu": _Activation(_relu, _relu_and_slope, 1.0),
+    "silu": _Activation(_silu, _silu_and_slope, 0.5),
+}
+
+
+def _forward(layers: list[Layer], value: Float, activation: _Activation) -> Float:
     for weight, bias in layers:
-        value = weight @ value + bias
-        active = value > 0
-        value = value * active
+        value = activation.value(weight @ value + bias)
+    return value
+
+
+def _forward_tangents(
+    layers: list[Layer], value: Float, tangents: Float, activation: _Activation
+) -> tuple[Float, Float]:
+    for weight, bias in layers:
+        value, slope = activation.value_and_slope(weight @ value + bias)
         tangents = weight @ tangents
-        tangents *= active[:, None]
+        tangents *= slope[:, None]
     return value, tangents
 
 

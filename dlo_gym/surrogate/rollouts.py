@@ -3,27 +3,19 @@
 A dataset is a folder:
 
     manifest.json     schema, settings, and the sha256 of every finished shard
-    shard_0000.npz    positions, clamps, lengths of ``shard_size`` rollouts, without pickle
+    shard_0000.npz    positions, clamps, rods of ``shard_size`` rollouts, without pickle
 
-Rollout i is made from its own child of the seed, so that the data depend neither on the number of
-workers nor on where a run was interrupted. Shards and manifest are written aside and renamed; a
-shard that the manifest does not vouch for is made again.
+Rollout i is made from its own child of the seed, so that the data depend neither on who works at
+them, processes or a Ray cluster, nor on where a run was interrupted. Shards and manifest are
+written aside and renamed; a shard that the manifest does not vouch for is made again.
 """
 
 import hashlib
 import json
-import multiprocessing
-import os
-import signal
-import threading
 import zipfile
-from collections.abc import Iterator
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import tyro
@@ -32,9 +24,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from dlo_gym.atomic_file import written_aside
 from dlo_gym.exceptions import DatasetError
+from dlo_gym.executor import run_tasks
 from dlo_gym.surrogate.simulation import Rollouts, RolloutSettings, simulate_rollout
 
-SCHEMA = "dlo-rollouts/1"
+SCHEMA = "dlo-rollouts/2"
 THE_PAPER = RolloutSettings()  # Section VI-A1
 
 
@@ -57,7 +50,10 @@ class Manifest(NamedTuple):
         try:
             content = json.loads(file.read_text())
             if content["schema"] != SCHEMA:
-                raise DatasetError(f"{file}: expected schema {SCHEMA}, got {content['schema']}")
+                raise DatasetError(
+                    f"{file}: expected schema {SCHEMA}, got {content['schema']}; make the data"
+                    " again by  dlo rollouts --overwrite"
+                )
             return cls(RolloutSettings(**content["settings"]), dict(content["shards"]))
         except FileNotFoundError:
             raise DatasetError(f"{folder}: no manifest.json, so this is not a dataset") from None
@@ -89,7 +85,7 @@ def load_rollouts(folder: Path) -> tuple[Rollouts, Manifest]:
             f" {folder} --resume and the settings in its manifest.json"
         )
     shards = [_read_shard(folder / shard_name(i)) for i in range(manifest.settings.n_shards)]
-    return Rollouts(*(np.concatenate(parts) for parts in zip(*shards, strict=True))), manifest
+    return Rollouts.joined(shards), manifest
 
 
 def shard_name(shard: int) -> str:
@@ -114,15 +110,19 @@ def _sha256(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
 
 
-def _make_shard(settings: RolloutSettings, folder: Path, shard: int) -> tuple[str, str]:
-    """Simulates and writes a shard; its name and sha256."""
-    made = [simulate_rollout(settings, index) for index in settings.shard_indices(shard)]
-    arrays = Rollouts(*(np.concatenate(parts) for parts in zip(*made, strict=True)))
+def simulate_shard(settings: RolloutSettings, shard: int) -> Rollouts:
+    """The rollouts of a shard."""
+    return Rollouts.joined(
+        simulate_rollout(settings, index) for index in settings.shard_indices(shard)
+    )
+
+
+def _write_shard(folder: Path, shard: int, arrays: Rollouts) -> str:
+    """Writes a shard; its sha256."""
     with written_aside(folder / shard_name(shard), DatasetError) as part:
         with part.open("wb") as file:
             np.savez(file, **arrays._asdict())
-        digest = _sha256(part)
-    return shard_name(shard), digest
+        return _sha256(part)
 
 
 def rollouts(
@@ -131,6 +131,7 @@ def rollouts(
     settings: tyro.conf.OmitArgPrefixes[RolloutSettings] = THE_PAPER,
     *,
     workers: int = 0,
+    ray_address: str | None = None,
     resume: bool = False,
     overwrite: bool = False,
 ) -> None:
@@ -140,12 +141,15 @@ def rollouts(
         out: folder to write.
         settings: what is simulated.
         workers: processes; 0 for one per core.
+        ray_address: simulate on the Ray cluster there, host:port, instead of on this machine's
+            cores; "local" starts one here. Needs  pip install 'dlo-gym[scale]'.
         resume: finish a dataset that was interrupted, and make damaged shards again.
         overwrite: throw away the dataset in OUT.
 
     Raises:
         FileExistsError: if OUT holds something and neither resume nor overwrite was given.
         DatasetError: if a file cannot be written; what was finished is kept for --resume.
+        WorkersLost: if processes were killed again and again; likewise.
         ValueError: if OUT holds a dataset of other settings.
     """
     console = Console(stderr=True)
@@ -163,10 +167,11 @@ def rollouts(
     with Progress(*columns, console=console) as progress:
         done = settings.n_rollouts - sum(len(settings.shard_indices(i)) for i in shards)
         task = progress.add_task("", total=settings.n_rollouts, completed=done)
-        for name, digest in _make_shards(settings, out, shards, workers or os.cpu_count() or 1):
-            manifest.shards[name] = digest
+        tasks = [(settings, shard) for shard in shards]
+        for i, made in run_tasks(simulate_shard, tasks, workers=workers, ray_address=ray_address):
+            manifest.shards[shard_name(shards[i])] = _write_shard(out, shards[i], made)
             manifest.write(out)
-            progress.advance(task, len(settings.shard_indices(int(name[6:-4]))))
+            progress.advance(task, len(made.rods))
     console.print(f"{settings.n_rollouts} rollouts in {out}", highlight=False, markup=False)
 
 
@@ -201,60 +206,3 @@ def _open_dataset(out: Path, settings: RolloutSettings, resume: bool, overwrite:
                 " resume with the same settings"
             )
     return manifest
-
-
-def _make_shards(
-    settings: RolloutSettings, folder: Path, shards: list[int], workers: int
-) -> Iterator[tuple[str, str]]:
-    """Names and hashes of shards as they are finished."""
-    if workers == 1 or len(shards) < 2:
-        for shard in shards:
-            yield _make_shard(settings, folder, shard)
-        return
-    context = multiprocessing.get_context("spawn")
-    with (
-        _one_thread_each(),
-        ProcessPoolExecutor(min(workers, len(shards)), context, _start_worker) as pool,
-    ):
-        futures: list[Future[Any]] = [
-            pool.submit(_make_shard, settings, folder, shard) for shard in shards
-        ]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        except BrokenProcessPool as error:
-            raise DatasetError(
-                f"{folder}: a worker process was killed, perhaps for memory; what was finished is"
-                " kept for --resume"
-            ) from error
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Processes started meanwhile use one BLAS thread: they already are one per core."""
-    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _start_worker() -> None:
-    """Ctrl-C is the parent's business, and a worker does not outlive a parent that was killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-
-        def follow() -> None:
-            parent.join()
-            os._exit(1)
-
-        threading.Thread(target=follow, daemon=True).start()

@@ -1,5 +1,6 @@
 """Random rollouts of a rod: a random settled state and random actions (Section VI-A1)."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -7,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_gym.exceptions import DatasetError, RodDiverged
-from dlo_gym.geometry.se3 import matrix_to_quaternion
+from dlo_gym.geometry.se3 import Array, matrix_to_quaternion
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.initial_shapes import random_boundary
 from dlo_gym.rod.properties import RodProperties
@@ -17,6 +18,11 @@ CLAMP_DISTANCE = (0.2, 0.98)  # of the rod's length, at the end of every action
 LARGEST_SLOPE = np.deg2rad(60.0)  # of the chord between the clamps
 LARGEST_TILT = np.deg2rad(100.0)  # between a clamp's d3 and the chord
 LARGEST_JUMP = 0.08  # of a node in one step, per rod length: more means that the rod snapped over
+# RodProperties, one row per rod, in SI units.
+ROD_COLUMNS = (
+    "length", "radius", "youngs_modulus", "density", "poisson_ratio",
+    "rest_curvature_1", "rest_curvature_2", "rest_twist",
+)  # fmt: skip
 ATTEMPTS = 100  # at an action before its rollout starts anew; at a rollout before giving up
 
 Array32 = NDArray[np.float32]
@@ -35,8 +41,11 @@ class RolloutSettings:
         n_steps: steps that each action is divided into.
         translation: largest component of an action's translation of each clamp [m].
         rotation: largest rotation about each of a clamp's two transverse axes per action [rad].
-        radius: of the rods [m].
-        youngs_modulus: [Pa].
+        radius_min, radius_max: of the rods, log-uniform [m].
+        youngs_modulus_min, youngs_modulus_max: log-uniform [Pa].
+        poisson_ratio_min, poisson_ratio_max: uniform.
+        rest_curvature_max: of the unloaded rods, about d1 and d2 together, uniform in every second
+            rod; the others are straight [1/m].
         density: [kg/m^3].
         n_elements: of the rods; the states have one node more.
         shard_size: rollouts per file.
@@ -53,8 +62,13 @@ class RolloutSettings:
     n_steps: int = 10
     translation: float = 0.05
     rotation: float = np.pi / 8
-    radius: float = 0.003
-    youngs_modulus: float = 1e6
+    radius_min: float = 0.003
+    radius_max: float = 0.003
+    youngs_modulus_min: float = 1e6
+    youngs_modulus_max: float = 1e6
+    poisson_ratio_min: float = 0.5
+    poisson_ratio_max: float = 0.5
+    rest_curvature_max: float = 0.0
     density: float = 1e3
     n_elements: int = 50
     shard_size: int = 50
@@ -67,18 +81,45 @@ class RolloutSettings:
             raise ValueError(f"seed: expected at least 0, got {self.seed}")
         if self.n_elements < 4:
             raise ValueError(f"n_elements: expected at least 4, got {self.n_elements}")
-        if not 0.0 < self.length_min <= self.length_max:
+        for name, above in (
+            ("length", 0.0), ("radius", 0.0), ("youngs_modulus", 0.0), ("poisson_ratio", -1.0),
+        ):  # fmt: skip
+            low, high = getattr(self, f"{name}_min"), getattr(self, f"{name}_max")
+            if not above < low <= high:
+                raise ValueError(
+                    f"{name}_min, {name}_max: expected {above:g} < {name}_min <= {name}_max,"
+                    f" got {low} and {high}"
+                )
+        if not self.rest_curvature_max >= 0.0:
             raise ValueError(
-                "length_min, length_max: expected 0 < length_min <= length_max,"
-                f" got {self.length_min} and {self.length_max}"
+                f"rest_curvature_max: expected at least 0, got {self.rest_curvature_max}"
             )
         for name in ("translation", "rotation"):
             if not 0.0 <= getattr(self, name) < np.pi:
                 raise ValueError(f"{name}: expected 0 to pi, got {getattr(self, name)}")
-        self.properties(self.length_min)
+        RodProperties(1.0, density=self.density, poisson_ratio=self.poisson_ratio_max)
 
-    def properties(self, length: float) -> RodProperties:
-        return RodProperties(length, self.radius, self.youngs_modulus, self.density)
+    def draw_rod(self, length: float, rng: np.random.Generator) -> RodProperties:
+        """A random rod of ``length`` [m]; always the same number of draws."""
+        radius, youngs_modulus = (
+            float(np.exp(rng.uniform(np.log(low), np.log(high))))
+            for low, high in (
+                (self.radius_min, self.radius_max),
+                (self.youngs_modulus_min, self.youngs_modulus_max),
+            )
+        )
+        poisson_ratio = rng.uniform(self.poisson_ratio_min, self.poisson_ratio_max)
+        curved, share, direction = rng.uniform(size=3)
+        bend = self.rest_curvature_max * share if curved < 0.5 else 0.0
+        angle = 2.0 * np.pi * direction
+        return RodProperties(
+            length,
+            radius,
+            youngs_modulus,
+            self.density,
+            poisson_ratio,
+            (bend * np.cos(angle), bend * np.sin(angle), 0.0),
+        )
 
     @property
     def n_states(self) -> int:
@@ -101,24 +142,50 @@ class Rollouts(NamedTuple):
         positions: (R, S, n, 3) centerlines in world [m].
         clamps: (R, S, 2, 4) wxyz of R_world_clamp, left and right; the clamps' origins are the
             first and last node.
-        lengths: (R,) of the rods [m].
+        rods: (R, 8) what each is made of, in the order of ``ROD_COLUMNS``.
     """
 
     positions: Array32
     clamps: Array32
-    lengths: Array32
+    rods: Array
+
+    @classmethod
+    def joined(cls, parts: Iterable["Rollouts"]) -> "Rollouts":
+        positions, clamps, rods = zip(*parts, strict=True)
+        return cls(np.concatenate(positions), np.concatenate(clamps), np.concatenate(rods))
+
+    def some(self, which: slice) -> "Rollouts":
+        """The rollouts ``which``."""
+        return Rollouts(self.positions[which], self.clamps[which], self.rods[which])
+
+    @property
+    def lengths(self) -> Array:
+        """(R,) of the rods [m]."""
+        return self.rods[:, 0]
+
+    def properties(self, index: int) -> RodProperties:
+        """Of the rod of rollout ``index``."""
+        *scalars, k1, k2, twist = (float(value) for value in self.rods[index])
+        return RodProperties(*scalars, rest_curvature=(k1, k2, twist))
 
 
 def simulate_rollout(settings: RolloutSettings, index: int) -> Rollouts:
     """Rollout ``index``, with a leading axis of 1.
 
+    The rod's material is drawn from a stream of its own, so that with the same seed rods of other
+    materials start alike and are asked to make the same moves.
+
     Raises:
         DatasetError: if the settings leave no rollout that can be simulated.
     """
-    rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(index,)))
+    rng, material = (
+        np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=key))
+        for key in ((index,), (index, 0))
+    )
     for _ in range(ATTEMPTS):
         length = rng.uniform(settings.length_min, settings.length_max)
-        rod = CosseratRod(settings.properties(length), settings.n_elements)
+        properties = settings.draw_rod(length, material)
+        rod = CosseratRod(properties, settings.n_elements)
         positions = np.empty((1, settings.n_states, rod.n_nodes, 3), np.float32)
         clamps = np.empty((1, settings.n_states, 2, 4), np.float32)
         try:
@@ -128,10 +195,17 @@ def simulate_rollout(settings: RolloutSettings, index: int) -> Rollouts:
                 _act(rod, settings, rng, first, positions, clamps)
         except RodDiverged:
             continue
-        return Rollouts(positions, clamps, np.array([length], np.float32))
+        return Rollouts(positions, clamps, _row(properties)[None])
     raise DatasetError(
         f"rollout {index}: no rollout with these settings could be simulated in {ATTEMPTS} attempts"
     )
+
+
+def _row(properties: RodProperties) -> Array:
+    """A uniform rod as (8,), in the order of ``ROD_COLUMNS``."""
+    p = properties
+    scalars = [p.length, p.radius, p.youngs_modulus, p.density, p.poisson_ratio]
+    return np.array([*scalars, *np.asarray(p.rest_curvature)], dtype=np.float64)
 
 
 def _act(

@@ -18,6 +18,7 @@ from dlo_gym.exceptions import DatasetError, MissingExtra, WeightsError
 from dlo_gym.geometry.se3 import Array, exp_so3, matrix_to_quaternion
 from dlo_gym.interrupts import deferred_interrupt
 from dlo_gym.rod.boundary import BoundaryDisplacement
+from dlo_gym.surrogate.conditioning import N_GROUPS
 from dlo_gym.surrogate.evaluation import Score, evaluate_predictor, score_table
 from dlo_gym.surrogate.predictor import ShapePredictor
 from dlo_gym.surrogate.rollouts import load_rollouts
@@ -93,9 +94,9 @@ class Trainer:
         self.settings = settings
         self.scales = Scales()
         self.data = RolloutDataset(
-            Rollouts(*(x[:cut] for x in rollouts)), noise=settings.noise, plain=settings.plain
+            rollouts.some(slice(cut)), noise=settings.noise, plain=settings.plain
         )
-        self.held_back = Rollouts(*(x[cut:] for x in rollouts))
+        self.held_back = rollouts.some(slice(cut, None))
         held_back = RolloutDataset(self.held_back, plain=settings.plain)
         generator = torch.Generator().manual_seed(1)
         self.validation = self._batch(held_back, VALIDATION_SIZE, generator)
@@ -105,7 +106,7 @@ class Trainer:
         self.network: DloNetwork | RelativeNetwork = kind(n_nodes, settings.hidden)
         self.generator = torch.Generator().manual_seed(settings.seed)
         if isinstance(self.network, RelativeNetwork):
-            self.network.fit(*self._batch(self.data, 80 * settings.batch_size, self.generator))
+            self.network.fit(self._batch(self.data, 80 * settings.batch_size, self.generator))
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=settings.learning_rate)
         self.step_count = 0
         self.best_loss = math.inf
@@ -142,10 +143,19 @@ class Trainer:
         """Of the best weights on the rollouts held back."""
         network = self.best_network()
         if isinstance(network, RelativeNetwork):
-            predict = ShapePredictor(Weights(network.export(), self.scales, {})).predict
-        else:
-            predict = partial(predict_plain, network)
-        return evaluate_predictor(predict, self.held_back, stride=5)
+            predictor = ShapePredictor(self.weights({}))
+            return evaluate_predictor(
+                lambda rod: predictor.for_rod(rod).predict, self.held_back, stride=5
+            )
+        predict = partial(predict_plain, network)
+        return evaluate_predictor(lambda _: predict, self.held_back, stride=5)
+
+    def weights(self, training: dict[str, Any]) -> Weights:
+        """The best weights for a file, with how they came about."""
+        network = self.best_network()
+        assert isinstance(network, RelativeNetwork)
+        layers, conditioning = network.export()
+        return Weights(layers, self.scales, training, conditioning, "silu")
 
     def save(self, file: Path) -> None:
         """All that is needed to go on exactly from here, written whole or not at all.
@@ -193,9 +203,10 @@ class Trainer:
 
     def _loss(self, batch: Batch) -> torch.Tensor:
         """The paper's mean squared error, or the mean distance of the nodes: the score itself."""
-        error = self.network(batch.state, batch.actions) - batch.change
-        if self.settings.plain:
+        if isinstance(self.network, DloNetwork):
+            error = self.network(batch.state, batch.actions) - batch.change
             return 1e4 * error.square().mean()
+        error = self.network(batch.state, batch.actions, batch.rods) - batch.change
         squares = error.view(len(error), -1, 3).square().sum(-1)
         return (squares + 1e-4).sqrt().mean()
 
@@ -214,6 +225,8 @@ def predict_plain(
         torch.zeros(1, *centerline.shape),
         torch.from_numpy(twists[:, :3]).float()[None],
         torch.from_numpy(matrix_to_quaternion(exp_so3(twists[:, 3:]))).float()[None],
+        torch.ones(1),
+        torch.zeros(1, N_GROUPS),
     )
     batch = encode_plain(moves)
     with torch.no_grad():
@@ -253,7 +266,8 @@ def train_surrogate(
     rollouts, manifest = load_rollouts(data)
     if evaluate:
         predictor = ShapePredictor.load(weights)
-        console.print(score_table(evaluate_predictor(predictor.predict, rollouts)))
+        scores = evaluate_predictor(lambda rod: predictor.for_rod(rod).predict, rollouts)
+        console.print(score_table(scores))
         return
     names = ("checkpoint.pt", "metrics.json", "shape_predictor.safetensors")
     checkpoint, metrics, file = (out / name for name in names)
@@ -283,9 +297,8 @@ def train_surrogate(
     }
     with written_aside(metrics, WeightsError) as part:
         part.write_text(json.dumps(content, indent=1) + "\n")
-    network = trainer.best_network()
-    if isinstance(network, RelativeNetwork):
-        save_weights(file, Weights(network.export(), trainer.scales, training))
+    if not settings.plain:
+        save_weights(file, trainer.weights(training))
         console.print(f"weights in {file}", highlight=False, markup=False)
 
 

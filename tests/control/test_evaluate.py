@@ -147,6 +147,19 @@ def test_the_gate_holds_every_action_of_the_environment(env):
         assert not {"translation step", "rotation step"} & set(reasons)
 
 
+@pytest.mark.slow
+def test_workers_do_not_change_an_episode(tmp_path):
+    found = []
+    for workers in (1, 2):
+        out = tmp_path / f"{workers}"
+        control(episodes=3, seed=2, max_steps=3, workers=workers, out=out)
+        metrics = json.loads((out / "metrics.json").read_text())
+        for entry in [metrics, *metrics["episodes"]]:
+            entry["control_ms"] = entry["tracking_ms"] = None
+        found.append(metrics)
+    assert found[0] == found[1]
+
+
 def test_the_command_writes_a_report_and_refuses_to_overwrite(tmp_path, capsys):
     out = tmp_path / "report"
     control(model="rod", episodes=2, seed=5, max_steps=3, out=out)

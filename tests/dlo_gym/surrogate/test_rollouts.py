@@ -98,11 +98,11 @@ class TestDataset:
     def test_a_folder_without_manifest_and_a_bad_manifest_are_named(self, tmp_path):
         with pytest.raises(DatasetError, match="no manifest.json"):
             load_rollouts(tmp_path)
-        (tmp_path / "manifest.json").write_text('{"schema": "dlo-rollouts/1", "settings"')
+        (tmp_path / "manifest.json").write_text('{"schema": "dlo-rollouts/2", "settings"')
         with pytest.raises(DatasetError, match="manifest.json: damaged"):
             load_rollouts(tmp_path)
-        (tmp_path / "manifest.json").write_text(json.dumps({"schema": "dlo-rollouts/7"}))
-        with pytest.raises(DatasetError, match="got dlo-rollouts/7"):
+        (tmp_path / "manifest.json").write_text(json.dumps({"schema": "dlo-rollouts/1"}))
+        with pytest.raises(DatasetError, match=r"got dlo-rollouts/1; make the data again"):
             load_rollouts(tmp_path)
 
     def test_a_full_disk_is_reported_and_leaves_nothing_half_written(

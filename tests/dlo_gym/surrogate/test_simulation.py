@@ -14,10 +14,10 @@ from dlo_gym.surrogate.simulation import RolloutSettings, plausible, simulate_ro
 TINY = RolloutSettings(n_rollouts=6, seed=1, n_actions=1, n_steps=2, n_elements=8, shard_size=2)
 
 
-def test_states_are_equilibria_of_the_recorded_clamps(small_rollouts, small_settings):
+def test_states_are_equilibria_of_the_recorded_clamps(small_rollouts):
     for i in range(3):
         positions = small_rollouts.positions[i].astype(float)
-        rod = CosseratRod(small_settings.properties(float(small_rollouts.lengths[i])), 50)
+        rod = CosseratRod(small_rollouts.properties(i), 50)
         for state in (0, 4, 10):
             held = boundary(positions[state], small_rollouts.clamps[i, state])
             settled = rod.settle(held, start=positions[state])
@@ -53,6 +53,34 @@ def test_lengths_and_clamp_distances_lie_in_their_ranges(small_rollouts):
     ratio = np.linalg.norm(chord, axis=-1) / lengths[:, None]
     assert ratio.min() > 0.2
     assert ratio.max() < 0.99
+
+
+def test_properties_lie_in_their_ranges_and_every_second_rod_is_straight():
+    settings = dataclasses.replace(
+        TINY, radius_min=0.002, radius_max=0.006, youngs_modulus_min=1e5, youngs_modulus_max=1e7,
+        poisson_ratio_min=0.1, rest_curvature_max=4.0,
+    )  # fmt: skip
+    rng = np.random.default_rng(0)
+    rods = [settings.draw_rod(0.5, rng) for _ in range(400)]
+    for name, low, high in (("radius", 0.002, 0.006), ("youngs_modulus", 1e5, 1e7)):
+        place = np.log([getattr(rod, name) / low for rod in rods]) / np.log(high / low)
+        assert 0.0 <= place.min() < 0.05
+        assert 0.95 < place.max() <= 1.0
+        assert abs(place.mean() - 0.5) < 0.05  # log-uniform
+    assert all(0.1 <= rod.poisson_ratio <= 0.5 for rod in rods)
+    bends = np.array([np.hypot(*rod.rest_curvature[:2]) for rod in rods])
+    assert abs((bends == 0.0).mean() - 0.5) < 0.1
+    assert 3.5 < bends.max() <= 4.0
+    assert all(rod.rest_curvature[2] == 0.0 for rod in rods)
+
+
+def test_other_materials_start_alike_and_are_asked_to_make_the_same_moves():
+    stiff = dataclasses.replace(TINY, youngs_modulus_min=2e6, youngs_modulus_max=3e6)
+    reference, other = simulate_rollout(TINY, 0), simulate_rollout(stiff, 0)
+    ends = (slice(None), slice(None), [0, -1])
+    np.testing.assert_array_equal(reference.positions[ends], other.positions[ends])
+    assert np.abs(reference.positions - other.positions).max() > 1e-3
+    assert 2e6 <= other.properties(0).youngs_modulus <= 3e6
 
 
 def test_clamps_hold_the_first_and_last_element(small_rollouts):
@@ -109,7 +137,12 @@ def test_a_rod_that_always_diverges_ends_in_an_error(monkeypatch):
         ({"n_elements": 2}, "n_elements"),
         ({"length_min": 0.7}, "length_min"),
         ({"translation": -0.1}, "translation"),
-        ({"radius": 0.0}, "radius"),
+        ({"radius_min": 0.0}, "radius"),
+        ({"radius_max": 0.001}, "radius_max"),
+        ({"youngs_modulus_min": np.nan}, "youngs_modulus"),
+        ({"poisson_ratio_max": 0.7}, "poisson_ratio"),
+        ({"density": 0.0}, "density"),
+        ({"rest_curvature_max": -1.0}, "rest_curvature_max"),
     ],
 )
 def test_settings_name_what_is_wrong(change, name):

@@ -8,9 +8,12 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from dlo_gym.exceptions import WeightsError
+from dlo_gym.rod.properties import RodProperties
+from dlo_gym.surrogate.conditioning import Conditioning
 from dlo_gym.surrogate.predictor import ShapePredictor
 from dlo_gym.surrogate.weights_file import (
     SHIPPED,
+    SHIPPED_ONE_ROD,
     Layers,
     Scales,
     Weights,
@@ -41,9 +44,34 @@ def random_weights(n_nodes: int = 7, hidden: int = 8, seed: int = 0) -> Weights:
     return Weights(layers, Scales(), {"seed": seed})
 
 
+def random_weights_for_many_rods(seed: int = 0) -> Weights:
+    one = random_weights(seed=seed)
+    rng = np.random.default_rng(seed)
+    units = sum(len(bias) for block in one.layers[:3] for _, bias in block)
+
+    def layer(inputs, outputs):
+        weight = rng.normal(0.0, 0.3, (outputs, inputs)).astype(np.float32)
+        return weight, rng.normal(0.0, 0.1, outputs).astype(np.float32)
+
+    conditioning = Conditioning(
+        np.array([-4.0, 0.6, 0.0, 0.0], np.float32),
+        np.array([0.0, 1.0, 0.1, 3.0], np.float32),
+        [layer(4, 6), layer(6, 5)],
+        layer(5, 2 * units),
+    )
+    guess = rng.normal(0.0, 0.3, (7, *one.layers.guess.shape)).astype(np.float32)
+    return Weights(one.layers._replace(guess=guess), one.scales, {}, conditioning, "silu")
+
+
 @pytest.fixture
 def file(tmp_path) -> Path:
     save_weights(tmp_path / "w.safetensors", random_weights())
+    return tmp_path / "w.safetensors"
+
+
+@pytest.fixture
+def file_for_many_rods(tmp_path) -> Path:
+    save_weights(tmp_path / "w.safetensors", random_weights_for_many_rods())
     return tmp_path / "w.safetensors"
 
 
@@ -66,6 +94,24 @@ def test_weights_survive_the_disk(file):
             np.testing.assert_array_equal(weight, weight_expected)
             np.testing.assert_array_equal(bias, bias_expected)
     np.testing.assert_array_equal(stored.layers.guess, expected.layers.guess)
+    assert stored.activation == "relu"
+    assert stored.conditioning is None
+    assert stored.for_rod(RodProperties(0.5)) is stored
+
+
+def test_weights_for_many_rods_survive_the_disk(file_for_many_rods):
+    stored, expected = load_weights(file_for_many_rods), random_weights_for_many_rods()
+    assert stored.activation == "silu"
+    for got, known in zip(stored.conditioning[:2], expected.conditioning[:2], strict=True):
+        np.testing.assert_array_equal(got, known)
+    for rod in (RodProperties(0.5), RodProperties(0.7, 0.005, 3e6, 2e3, 0.2, (1.0, 2.0, 0.0))):
+        one, same = stored.for_rod(rod), expected.for_rod(rod)
+        assert one.scales == same.scales
+        for block, known in zip(one.layers[:3], same.layers[:3], strict=True):
+            for (weight, bias), (weight_expected, bias_expected) in zip(block, known, strict=True):
+                np.testing.assert_array_equal(weight, weight_expected)
+                np.testing.assert_array_equal(bias, bias_expected)
+        np.testing.assert_array_equal(one.layers.guess, same.layers.guess)
 
 
 def test_a_missing_file_is_named(tmp_path):
@@ -116,7 +162,7 @@ def wrong_type(tensors, metadata):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (set_schema, r"expected schema dlo-shape-predictor/1, got dlo-shape-predictor/9"),
+        (set_schema, r"expected schema dlo-shape-predictor/2.*got dlo-shape-predictor/9"),
         (drop_scales, "scales"),
         (unknown_scale, "smell"),
         (drop_tensor, r"prediction.2.bias: expected shape \(8,\), got none"),
@@ -132,9 +178,41 @@ def test_what_is_wrong_is_named_with_the_file(file, change, message):
         load_weights(file)
 
 
+def drop_groups(tensors, metadata):
+    del tensors["groups.low"]
+
+
+def narrow_modulation(tensors, metadata):
+    tensors["modulation.0.weight"] = tensors["modulation.0.weight"][1:]
+
+
+def drop_embedding(tensors, metadata):
+    del tensors["embedding.1.weight"]
+
+
+def guess_of_one_rod(tensors, metadata):
+    tensors["guess"] = tensors["guess"][0]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (drop_groups, r"groups.low: expected shape \(4,\), got none"),
+        (narrow_modulation, r"modulation.0.weight: expected shape \(154, 5\), got \(153, 5\)"),
+        (drop_embedding, r"embedding.1.weight as a matrix"),
+        (guess_of_one_rod, r"guess: expected shape \(7, 14, 21\), got \(14, 21\)"),
+    ],
+)
+def test_what_is_wrong_for_many_rods_is_named(file_for_many_rods, change, message):
+    rewrite(file_for_many_rods, change)
+    with pytest.raises(WeightsError, match=rf"w\.safetensors.*{message}"):
+        load_weights(file_for_many_rods)
+
+
 def test_the_shipped_weights_say_how_they_were_trained():
     training = load_weights(SHIPPED).training
     assert training["seed"] == 0
-    assert training["rollouts"]["n_rollouts"] == 2500
+    assert training["rollouts"]["youngs_modulus_max"] == 1e7
+    assert load_weights(SHIPPED_ONE_ROD).training["rollouts"]["n_rollouts"] == 2500
     assert len(training["data_sha256"]) == 64
     assert SHIPPED.with_name("MODEL_CARD.md").is_file()
