@@ -1,4 +1,4 @@
-"""Milliseconds per rendered view: OpenGL, the same with shadows and antialiasing, the rasteriser."""
+"""Milliseconds per view: OpenGL, the same with shadows and antialiasing, the rasteriser."""
 
 import time
 

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from dlo_gym.geometry.se3 import Array
-from dlo_gym.scene._kernels_rays import FAST, BOX, CAPSULE, CYLINDER, PLANE, meet, normal
+from dlo_gym.scene._kernels_rays import BOX, CAPSULE, CYLINDER, FAST, PLANE, meet, normal
 
 TINTS = 64  # colours from one rim of a cylinder to the other
 SAMPLES = 4  # of a texture, across and down each pixel
@@ -74,11 +74,11 @@ def draw(image, nearness, pinhole, primitives, lights):
         lit = Lights(towards, halfway, lights.diffuse, lights.specular, lights.ambient)
         spans = (first, last, left, right)
         paint = primitives.paints[i]
-        hidden_axis = origin[0] ** 2 + origin[1] ** 2 > size[0] ** 2
+        beside_axis = origin[0] ** 2 + origin[1] ** 2 > size[0] ** 2
         if kind == BOX and not clipped:
             _tint_box(tints, paint, lit, origin)
             _fill_box(image, nearness, spans, size, origin, rays, tints)
-        elif kind == CYLINDER and hidden_axis:
+        elif kind == CYLINDER and beside_axis:
             _tint_cylinder(tints, paint, lit, origin)
             _fill_cylinder(image, nearness, spans, size, origin, rays, tints)
         else:
