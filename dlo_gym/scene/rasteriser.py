@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_gym.geometry.camera import CameraModel
-from dlo_gym.geometry.se3 import Array
 from dlo_gym.scene._kernels_raster import Lights, Pinhole, draw, paint_texture
 from dlo_gym.scene._kernels_rays import PLANE
 from dlo_gym.scene.primitives import ModelPrimitives
@@ -20,7 +19,7 @@ class Layer(NamedTuple):
     """Colours (height, width, 3) and nearness (height, width), which is 1 / depth [1/m]."""
 
     rgb: NDArray[np.uint8]
-    nearness: Array
+    nearness: NDArray[np.float32]
 
 
 class RasterCanvas:
@@ -39,13 +38,14 @@ class RasterCanvas:
         self._moving = np.setdiff1d(np.arange(model.ngeom), scenery)
         self._primitives = ModelPrimitives(model)
         self._scenery: dict[str, Layer] = {}
+        self._nearness: dict[str, NDArray[np.float32]] = {}
 
     def color(self, data: mujoco.MjData, name: str, pinhole: CameraModel) -> NDArray[np.uint8]:
         """RGB (height, width, 3) of the model's camera ``name``."""
         return self.layer(data, name, pinhole).rgb
 
     def layer(self, data: mujoco.MjData, name: str, pinhole: CameraModel) -> Layer:
-        """Colours and depth of the model's camera ``name``."""
+        """Colours and depth of the model's camera ``name``, the latter until the next call."""
         layer = self._copy_of_scenery(data, name, pinhole)
         self._draw(layer, data, pinhole, self._moving)
         return layer
@@ -66,10 +66,13 @@ class RasterCanvas:
     def _copy_of_scenery(self, data: mujoco.MjData, name: str, pinhole: CameraModel) -> Layer:
         if name not in self._scenery:
             shape = (pinhole.height, pinhole.width)
-            self._scenery[name] = Layer(np.zeros((*shape, 3), np.uint8), np.zeros(shape))
-            self._draw_scenery(self._scenery[name], data, pinhole)
+            scenery = Layer(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.float32))
+            self._draw_scenery(scenery, data, pinhole)
+            self._scenery[name] = scenery
+            self._nearness[name] = np.empty(shape, np.float32)
         scenery = self._scenery[name]
-        return Layer(scenery.rgb.copy(), scenery.nearness.copy())
+        np.copyto(self._nearness[name], scenery.nearness)
+        return Layer(scenery.rgb.copy(), self._nearness[name])
 
     def _draw_scenery(self, layer: Layer, data: mujoco.MjData, pinhole: CameraModel) -> None:
         model = self._model
