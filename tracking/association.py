@@ -101,10 +101,12 @@ def correct_occluded(
 
 def image_tangents(pixels: Array) -> Array:
     """Unit tangents (n, 2) of a projected centerline (n, 2); zero where it is seen end on."""
+    tangents = np.empty_like(pixels)
+    tangents[1:-1] = 0.5 * (pixels[2:] - pixels[:-2])
+    tangents[0], tangents[-1] = pixels[1] - pixels[0], pixels[-1] - pixels[-2]
+    norms = np.hypot(tangents[:, 0], tangents[:, 1])
     with np.errstate(invalid="ignore"):
-        tangents = np.gradient(pixels, axis=0)
-        norms = np.linalg.norm(tangents, axis=1, keepdims=True)
-        return np.where(norms > 1e-9, tangents / np.maximum(norms, 1e-9), 0.0)
+        return np.where(norms[:, None] > 1e-9, tangents / np.maximum(norms, 1e-9)[:, None], 0.0)
 
 
 @numba.njit(cache=True)

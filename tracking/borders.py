@@ -6,6 +6,7 @@ cable is where a window of that width holds the most of what differs from both f
 """
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,17 +37,9 @@ def centre_between_borders(
     half = int(np.ceil(FLANK * max(radius, 1.0) / STEP))
     across = STEP * np.arange(-half, half + 1, dtype=np.float64)
     profile = _profiles(image, points, directions, normals, across, spacing)
-    beyond = (1.0 + SEARCH) * radius + 1.0
-    flanks = [np.median(profile[:, side * across > beyond][:, ::2], axis=1) for side in (-1, 1)]
-    differences = [np.linalg.norm(profile - flank[:, None], axis=2) for flank in flanks]
-    excess = np.maximum(np.minimum(*differences) - QUIET, 0.0)
-    excess /= excess + CLEAR
-    total = np.cumsum(np.pad(excess, ((0, 0), (1, 0))), axis=1)
-    window, reach = round(radius / STEP), round(SEARCH * radius / STEP)
-    middles = np.arange(half - reach, half + reach + 1)
-    held = total[:, middles + window + 1] - total[:, middles - window]
-    best = held >= PLATEAU * held.max(axis=1, keepdims=True)
-    shifts = (best * across[middles]).sum(axis=1) / best.sum(axis=1)
+    # Every second column from where no cable can be to the outer limit.
+    gap = half + 1 - int(np.ceil(((1.0 + SEARCH) * radius + 1.0) / STEP + 1e-9))
+    shifts = STEP * _shifts(profile, gap, round(radius / STEP), round(SEARCH * radius / STEP))
     padded = np.pad(shifts, AGREEMENT // 2, mode="edge")
     agreed = np.median(np.lib.stride_tricks.sliding_window_view(padded, AGREEMENT), axis=1)
     return points + agreed[:, None] * normals
@@ -72,3 +65,46 @@ def _profiles(
         image, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     return colours.reshape(len(points), len(along), len(across), 3).mean(axis=1, dtype=np.float32)
+
+
+@numba.njit(cache=True)
+def _shifts(profile, flank, window, reach):  # pragma: no cover
+    """Shifts (n,) [columns] from the middle to the best of colours (n, columns, 3).
+
+    Args:
+        flank: columns at either end that the cable cannot reach.
+        window: half the cable's width in columns.
+        reach: largest shift in columns.
+    """
+    n, n_columns = profile.shape[:2]
+    half = n_columns // 2
+    shifts = np.empty(n)
+    flanks = np.empty((2, 3))
+    total = np.empty(n_columns + 1)
+    held = np.empty(2 * reach + 1)
+    for i in range(n):
+        for channel in range(3):
+            flanks[0, channel] = np.median(profile[i, :flank:2, channel])
+            flanks[1, channel] = np.median(profile[i, n_columns - flank :: 2, channel])
+        total[0] = 0.0
+        for column in range(n_columns):
+            difference = np.inf
+            for side in range(2):
+                squared = 0.0
+                for channel in range(3):
+                    squared += (profile[i, column, channel] - flanks[side, channel]) ** 2
+                difference = min(difference, np.sqrt(squared))
+            excess = max(difference - QUIET, 0.0)
+            total[column + 1] = total[column] + excess / (excess + CLEAR)
+        best = 0.0
+        for k in range(2 * reach + 1):
+            middle = half - reach + k
+            held[k] = total[middle + window + 1] - total[middle - window]
+            best = max(best, held[k])
+        weight, moment = 0, 0
+        for k in range(2 * reach + 1):
+            if held[k] >= PLATEAU * best:
+                weight += 1
+                moment += k - reach
+        shifts[i] = moment / weight
+    return shifts

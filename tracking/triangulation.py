@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigh, solve
+from scipy.linalg import LinAlgError, eigh, lapack
 
 from dlo_gym.geometry.camera import CameraModel
 from dlo_gym.geometry.se3 import Array
@@ -82,7 +82,9 @@ def sight_across(camera: CameraModel, pixels: Array, directions: Array, weights:
         rays = camera.rays(
             np.stack([pixels[seen] - directions[seen], pixels[seen] + directions[seen]])
         )
-        across = np.cross(rays[0], rays[1])
+        (ax, ay, az), (bx, by, bz) = rays[0].T, rays[1].T
+        # What np.cross does, in a quarter of its time.
+        across = np.column_stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
         normals[seen] = across / np.linalg.norm(across, axis=1, keepdims=True)
     return Sight(normals, camera.centre, np.where(seen, weights, 0.0))
 
@@ -130,9 +132,8 @@ def fit_curve(
         if not len(free):
             break
         reduced = matrix.reshape(3 * n, 3 * n)[np.ix_(unknown, unknown)]
-        step = solve(
-            reduced, gradient.ravel()[unknown], assume_a="pos", lower=True, check_finite=False
-        )
+        _, step, info = lapack.dposv(reduced, gradient.ravel()[unknown], lower=True)
+        _check_definite(info)
         curve = curve.copy()
         curve[free] -= step.reshape(-1, 3)
     return CurveFit(curve, matrix.reshape(3 * n, 3 * n), free)
@@ -156,9 +157,17 @@ class CurveFit(NamedTuple):
         unknown = (3 * self.free[:, None] + np.arange(3)).ravel()
         deviation = np.zeros(len(self.centerline))
         if len(unknown):
-            covariance = np.linalg.inv(self.information[np.ix_(unknown, unknown)])
+            factor, info = lapack.dpotrf(self.information[np.ix_(unknown, unknown)], lower=True)
+            _check_definite(info)
+            covariance, _ = lapack.dpotri(factor, lower=True)
             deviation[self.free] = np.sqrt(np.diag(covariance).reshape(-1, 3).sum(axis=1))
         return deviation
+
+
+def _check_definite(info: int) -> None:
+    """Raises LinAlgError on LAPACK's word that a matrix is not positive definite."""
+    if info != 0:
+        raise LinAlgError("the fit's information matrix is not positive definite")
 
 
 def bending_modes(
