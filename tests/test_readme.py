@@ -8,7 +8,9 @@ import pytest
 README = Path(__file__).parent.parent / "README.md"
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/rod.md", "docs/control.md", "docs/surrogate.md"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "docs/rod.md", "docs/control.md", "docs/surrogate.md"]
+)
 def test_python_examples_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text = (README.parent / page).read_text()
