@@ -124,8 +124,11 @@ class WorldConfig:
     @property
     def scene(self) -> SceneConfig:
         """What the cameras see."""
+        # The rasteriser leaves the processor to the robots; it draws no boards and no shadows.
+        simple = self.board is None and self.quality == "fast"
         return SceneConfig(
             cameras=self.cameras,
+            renderer="raster" if simple else "opengl",
             rod_radius=float(np.max(self.rod.radius)),
             n_nodes=self.n_elements + 1 if self.board is None else 0,
             boards=() if self.board is None else (self._plate(self.board),),
