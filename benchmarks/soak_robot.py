@@ -68,11 +68,12 @@ def soak(config: CellConfig, minutes: float) -> Iterator[Soak]:
     with EmulatedCell.of(config) as emulation, RobotCell(config) as robot:
         robot.open()
         robot.engage()
+        home = robot.commanded  # goals are drawn from here, or they would wander off
         for goal_seed in itertools.count():
             if time.monotonic() >= end:
                 return
             _make_ready(robot, result)
-            loop = ClosedLoop(config, make_goal("sampled", config, robot.commanded, goal_seed))
+            loop = ClosedLoop(config, make_goal("sampled", config, home, goal_seed))
             for step in control_steps(robot, loop, steps=EPISODE, recoveries=RECOVERIES):
                 result.steps += 1
                 result.late.append(step.late)
