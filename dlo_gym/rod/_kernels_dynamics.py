@@ -12,7 +12,8 @@ stage's implicit length, V = (Y - b) / s and V = c + s a(Y), so Y minimises
 TR-BDF2 is L-stable, and its stages are of order 2: stiff stretch, and the directors' constraint,
 which one-step methods of lower stage order answer with order 1, keep the full order. Damping stays
 a quadratic: external -c m V shifts M's springs, and the stress S eta d(strain)/dt of a Kelvin-Voigt
-rod is a stiffness S (1 + eta / s) with a shifted rest strain.
+rod is a stiffness S eta / s that rests at the strain's own b. So is a share of the stiffness that
+relaxes towards the present curvature. Plastic curvature flows within each stage.
 """
 
 from math import sqrt
@@ -23,7 +24,12 @@ from numba import njit
 
 from dlo_gym.rod._kernels_assembly import System, assemble
 from dlo_gym.rod._kernels_banded import factorise
-from dlo_gym.rod._kernels_energy import RodArrays, quaternion_to_columns, strains
+from dlo_gym.rod._kernels_energy import (
+    RodArrays,
+    flow_plastically,
+    quaternion_to_columns,
+    strains,
+)
 from dlo_gym.rod._kernels_inertia import Inertia
 from dlo_gym.rod._kernels_rates import (
     accelerations,
@@ -34,7 +40,14 @@ from dlo_gym.rod._kernels_rates import (
     kinetic_energy,
     strain_rates,
 )
-from dlo_gym.rod._kernels_solve import CONVERGED, STALLED, exact_stress, follow, free_range
+from dlo_gym.rod._kernels_solve import (
+    CONVERGED,
+    STALLED,
+    Limits,
+    exact_stress,
+    follow,
+    free_range,
+)
 
 GAMMA = 2.0 - sqrt(2.0)
 BDF_NEW = 1.0 / (GAMMA * (2.0 - GAMMA))
@@ -53,11 +66,19 @@ class Motion(NamedTuple):
         mass: (3 n + 1,) of the places: m [kg] of nodes, J = m r^2 / 4 [kg m^2] of directors.
         external: damping proportional to mass [1/s].
         internal: damping proportional to stiffness [s].
+        creep: share of the bending and twisting stiffness that relaxes [-].
+        relaxation: its time constant [s].
+        yields: whether the rod bends plastically.
+        rest_curvature: (n + 1, 3) kappa0 of the rod as made [1/m].
     """
 
     mass: np.ndarray
     external: float
     internal: float
+    creep: float
+    relaxation: float
+    yields: bool
+    rest_curvature: np.ndarray
 
 
 class Plan(NamedTuple):
@@ -82,7 +103,9 @@ class Moment(NamedTuple):
     Attributes:
         places: (3 n + 1, 3) nodes [m] and directors [-].
         speeds: (3 n + 1, 3) of places [1/s].
-        strain: (2 n + 1, 3) of elements and nodes; kept for internal damping only.
+        strain: (2 n + 1, 3) of elements, curvature of nodes; kept for inelastic rods only.
+        plastic: (n + 1, 2) plastic curvature [1/m].
+        creep: (n + 1, 3) curvature at which the relaxing part of the stiffness rests [1/m].
         q: (n, 4) quaternions of the elements.
         w: (n, 3) their angular velocities [rad/s].
     """
@@ -90,6 +113,8 @@ class Moment(NamedTuple):
     places: np.ndarray
     speeds: np.ndarray
     strain: np.ndarray
+    plastic: np.ndarray
+    creep: np.ndarray
     q: np.ndarray
     w: np.ndarray
 
@@ -111,6 +136,8 @@ class Scratch(NamedTuple):
 def _empty_moment(n):
     return Moment(
         np.empty((3 * n + 1, 3)), np.zeros((3 * n + 1, 3)), np.zeros((2 * n + 1, 3)),
+        np.zeros((n + 1, 2)),
+        np.zeros((n + 1, 3)),
         np.empty((n, 4)), np.empty((n, 3)),
     )  # fmt: skip
 
@@ -121,6 +148,7 @@ def _scratch(system, n):
     stage_rod = RodArrays(
         rod.rest_length, rod.shear.copy(), rod.rest_strain.copy(), rod.bending.copy(),
         rod.rest_curvature.copy(), rod.voronoi_length, rod.forces,
+        rod.plastic, rod.yield_moment, rod.hardening, np.zeros((n + 1, 3)), np.zeros((n + 1, 3)),
     )  # fmt: skip
     stage = System(stage_rod, Inertia(np.empty(3 * n + 1), np.empty((3 * n + 1, 3))))
     return Scratch(
@@ -131,9 +159,9 @@ def _scratch(system, n):
 
 @njit(cache=True)
 def _combine(a, A, b, B, out):
-    """Update ``out`` to a A + b B, all (m, 3); ``out`` may be one of them."""
+    """Update ``out`` to a A + b B, all of one shape; ``out`` may be one of them."""
     for i in range(A.shape[0]):
-        for k in range(3):
+        for k in range(A.shape[1]):
             out[i, k] = a * A[i, k] + b * B[i, k]
 
 
@@ -143,10 +171,10 @@ def _copy(source, out):
     _combine(1.0, source.places, 0.0, source.places, out.places)
     _combine(1.0, source.speeds, 0.0, source.speeds, out.speeds)
     _combine(1.0, source.strain, 0.0, source.strain, out.strain)
+    _combine(1.0, source.plastic, 0.0, source.plastic, out.plastic)
+    _combine(1.0, source.creep, 0.0, source.creep, out.creep)
     _combine(1.0, source.w, 0.0, source.w, out.w)
-    for e in range(source.q.shape[0]):
-        for k in range(4):
-            out.q[e, k] = source.q[e, k]
+    _combine(1.0, source.q, 0.0, source.q, out.q)
 
 
 @njit(cache=True)
@@ -160,10 +188,54 @@ def _hold(path, ends, now):
 
 
 @njit(cache=True)
-def _set_strain(rod, ends, now):
-    """Update the moment's strain."""
+def _inelastic(motion):
+    return motion.internal > 0.0 or motion.creep > 0.0 or motion.yields
+
+
+@njit(cache=True)
+def _set_material(system, motion, now):
+    """Update the system's plastic and rest curvature to those of ``now``."""
+    _combine(1.0, now.plastic, 0.0, now.plastic, system.rod.plastic)
+    rest = system.rod.rest_curvature
+    _combine(1.0, motion.rest_curvature, motion.creep, now.creep, rest)
+
+
+@njit(cache=True)
+def _bent(motion, now, out):
+    """Update ``out`` (n + 1, 3) to the elastic curvature kappa - kappa0 - plastic."""
     n = now.q.shape[0]
-    strains(rod, now.places, now.q, ends, now.strain[:n], now.strain[n:])
+    _combine(1.0, now.strain[n:], -1.0, motion.rest_curvature, out)
+    for i in range(n + 1):
+        for k in range(2):
+            out[i, k] -= now.plastic[i, k]
+
+
+@njit(cache=True)
+def _flow(system, motion, s, base, stage, ends, now):
+    """Update the moment's plastic curvature, creep and strain at the end of a stage."""
+    n = now.q.shape[0]
+    kappa = now.strain[n:]
+    strains(system.rod, now.places, now.q, ends, now.strain[:n], kappa)
+    if motion.yields:
+        flow_plastically(stage.rod, kappa, now.plastic)
+    if motion.creep > 0.0:
+        _bent(motion, now, now.creep)
+        a = s / motion.relaxation
+        _combine(1.0 / (1.0 + a), base.creep, a / (1.0 + a), now.creep, now.creep)
+    _set_material(system, motion, now)
+
+
+@njit(cache=True)
+def hidden_energy(motion, rod, creep, plastic):
+    """Energy [J] of hardening and of the relaxing stiffness that ``assemble`` leaves out."""
+    energy = 0.0
+    for i in range(plastic.shape[0]):
+        for k in range(2):
+            energy += 0.5 * rod.voronoi_length[i] * rod.hardening[i] * plastic[i, k] ** 2
+        for k in range(3):
+            stiffness = motion.creep * (1.0 - motion.creep) * rod.bending[i, k]
+            energy += 0.5 * rod.voronoi_length[i] * stiffness * creep[i, k] ** 2
+    return energy
 
 
 @njit(cache=True)
@@ -178,14 +250,20 @@ def _set_stage(rod, motion, s, base, ends, stage):
         stage.inertia.weight[n] = 0.0
     # Where the damped, unloaded motion ends.
     _combine(1.0, base.places, s / (1.0 + damping), base.speeds, stage.inertia.centre)
-    if motion.internal == 0.0:
+    if not _inelastic(motion):
         return
     share = motion.internal / s
-    stiffer, shift = 1.0 + share, share / (1.0 + share)
-    _combine(stiffer, rod.shear, 0.0, rod.shear, stage.rod.shear)
-    _combine(stiffer, rod.bending, 0.0, rod.bending, stage.rod.bending)
-    _combine(1.0 / stiffer, rod.rest_strain, shift, base.strain, stage.rod.rest_strain)
-    _combine(1.0 / stiffer, rod.rest_curvature, shift, base.strain[n:], stage.rod.rest_curvature)
+    _combine(1.0 + share, rod.shear, 0.0, rod.shear, stage.rod.shear)
+    shift = share / (1.0 + share)
+    _combine(1.0 - shift, rod.rest_strain, shift, base.strain, stage.rod.rest_strain)
+    _combine(share, rod.bending, 0.0, rod.bending, stage.rod.viscous)
+    _combine(1.0, base.strain[n:], 0.0, base.strain[n:], stage.rod.viscous_centre)
+    # M = B (k - c k_v) for k = kappa - kappa0 - plastic, k_v = (b_v + a k) / (1 + a).
+    a = s / motion.relaxation
+    softer = 1.0 - motion.creep * a / (1.0 + a)
+    crept = motion.creep / ((1.0 + a) * softer)
+    _combine(softer, rod.bending, 0.0, rod.bending, stage.rod.bending)
+    _combine(1.0, motion.rest_curvature, crept, base.creep, stage.rod.rest_curvature)
 
 
 @njit(cache=True)
@@ -221,7 +299,10 @@ def _solve_stage(system, motion, path, s, time, ends, now, scratch, limits, work
     first, last = free_range(n, ends.right_held)
     factorise(work.band, first, last)
     _follow_clamps(path, time, ends, now, scratch)
-    status, _ = follow(stage, x, now.q, ends, scratch.twist, scratch.rotations, limits, work)
+    # Rounding errors grow with the stiffness.
+    residual = limits.residual * (1.0 + motion.internal / s)
+    looser = Limits(residual, limits.force, limits.torque)
+    status, _ = follow(stage, x, now.q, ends, scratch.twist, scratch.rotations, looser, work)
     for k in range(3):
         x[0, k] = scratch.clamps[0, k]
         if ends.right_held:
@@ -229,8 +310,8 @@ def _solve_stage(system, motion, path, s, time, ends, now, scratch, limits, work
     directors(now.q, now.places)
     _combine(1.0 / s, now.places, -1.0 / s, base.places, now.speeds)
     _hold(path, ends, now)
-    if motion.internal > 0.0:
-        _set_strain(system.rod, ends, now)
+    if _inelastic(motion):
+        _flow(system, motion, s, base, stage, ends, now)
     return status
 
 
@@ -249,16 +330,22 @@ def _trapezoid_base(system, motion, path, s, ends, now, scratch, work):
                 for j in range(3):
                     spin[side, k] += scratch.rotations[side, j, k] * path.velocity[6 * side + 3 + j]
         strain_rates(rod, x, now.q, ends, v, now.w, spin, base.strain)
-        # The stress S (gamma + eta d gamma/dt) as that of a shifted rest strain.
+        # The stress S eta d(strain)/dt as that of springs.
         eta = motion.internal
         _combine(1.0, rod.shear, 0.0, rod.shear, stage.rod.shear)
         _combine(1.0, rod.bending, 0.0, rod.bending, stage.rod.bending)
         _combine(1.0, rod.rest_strain, -eta, base.strain, stage.rod.rest_strain)
-        _combine(1.0, rod.rest_curvature, -eta, base.strain[n:], stage.rod.rest_curvature)
+        _combine(1.0, rod.rest_curvature, 0.0, rod.rest_curvature, stage.rod.rest_curvature)
+        _combine(eta / s, rod.bending, 0.0, rod.bending, stage.rod.viscous)
+        _combine(1.0, now.strain[n:], -s, base.strain[n:], stage.rod.viscous_centre)
         _combine(1.0, now.strain, s, base.strain, base.strain)
         assemble(System(stage.rod, system.inertia), x, now.q, ends, work, False)
     else:
         assemble(system, x, now.q, ends, work, False)
+    if motion.creep > 0.0:
+        a = s / motion.relaxation
+        _bent(motion, now, base.creep)
+        _combine(1.0 - a, now.creep, a, base.creep, base.creep)
     accelerations(motion, now.q, now.w, now.speeds, work.gradient, base.speeds)
     _combine(1.0, now.speeds, s, base.speeds, base.speeds)
     _combine(1.0, now.places, s, now.speeds, base.places)
@@ -270,6 +357,7 @@ def _bdf_base(before, middle, base):
     _combine(BDF_NEW, middle.places, -BDF_OLD, before.places, base.places)
     _combine(BDF_NEW, middle.speeds, -BDF_OLD, before.speeds, base.speeds)
     _combine(BDF_NEW, middle.strain, -BDF_OLD, before.strain, base.strain)
+    _combine(BDF_NEW, middle.creep, -BDF_OLD, before.creep, base.creep)
 
 
 @njit(cache=True)
@@ -332,8 +420,8 @@ def _step(system, motion, path, plan, time, h, ends, now, scratch, limits, work)
 
 
 @njit(cache=True)
-def advance(system, motion, path, ends, x, q, v, w, plan, limits, work):
-    """Update x, q, v, w along ``path``; returns (status, time reached [s], energy [J]).
+def advance(system, motion, path, ends, x, q, v, w, creep, plan, limits, work):
+    """Update x, q, v, w, creep along ``path``; returns (status, time reached [s], energy [J]).
 
     Steps are shortened where Newton's method fails, where the error estimate exceeds the
     tolerance, or where energy appears from nowhere; what little is left of such a gain is taken
@@ -347,8 +435,11 @@ def advance(system, motion, path, ends, x, q, v, w, plan, limits, work):
     directors(now.q, now.places)
     director_velocities(now.q, now.w, now.speeds)
     _hold(path, ends, now)
-    if motion.internal > 0.0:
-        _set_strain(system.rod, ends, now)
+    now.creep[:] = creep
+    if _inelastic(motion):
+        strains(system.rod, now.places, now.q, ends, now.strain[:n], now.strain[n:])
+        flow_plastically(system.rod, now.strain[n:], now.plastic)
+        _set_material(system, motion, now)
     still = True
     for k in range(12):
         still = still and path.velocity[k] == 0.0
@@ -356,6 +447,7 @@ def advance(system, motion, path, ends, x, q, v, w, plan, limits, work):
     h, time, status = full, 0.0, CONVERGED
     frames = ends.frames.copy()
     stored = assemble(system, now.places[: n + 1], now.q, ends, work, False)
+    stored += hidden_energy(motion, system.rod, now.creep, now.plastic)
     kinetic = kinetic_energy(motion, now.speeds, now.w)
     while time < plan.duration:
         final = h > (plan.duration - time) * (1.0 - 1e-9)
@@ -369,6 +461,7 @@ def advance(system, motion, path, ends, x, q, v, w, plan, limits, work):
         new_stored, new_kinetic, growth = stored, kinetic, 0.5
         if accepted:
             new_stored = assemble(system, now.places[: n + 1], now.q, ends, work, False)
+            new_stored += hidden_energy(motion, system.rod, now.creep, now.plastic)
             new_kinetic = kinetic_energy(motion, now.speeds, now.w)
             gain = new_stored + new_kinetic - stored - kinetic - clamp_work
             growth = 2.0
@@ -385,6 +478,7 @@ def advance(system, motion, path, ends, x, q, v, w, plan, limits, work):
                 accepted, growth = False, min(growth, 0.5)
         if not accepted:
             _copy(before, now)
+            _set_material(system, motion, now)
             ends.frames[:] = frames
             h *= growth
             if h < SMALLEST_STEP * full:
@@ -401,5 +495,5 @@ def advance(system, motion, path, ends, x, q, v, w, plan, limits, work):
         time = plan.duration if final else time + h
         h = min(full, h * growth)
     x[:], v[:] = now.places[: n + 1], now.speeds[: n + 1]
-    q[:], w[:] = now.q, now.w
+    q[:], w[:], creep[:] = now.q, now.w, now.creep
     return status, time, stored
