@@ -25,12 +25,22 @@ from numba import njit
 from dlo_gym.rod._kernels_assembly import System, assemble
 from dlo_gym.rod._kernels_banded import factorise
 from dlo_gym.rod._kernels_energy import (
-    RodArrays,
     flow_plastically,
     quaternion_to_columns,
     strains,
 )
-from dlo_gym.rod._kernels_inertia import Inertia
+from dlo_gym.rod._kernels_moment import (
+    bent,
+    combine,
+    copy_moment,
+    empty_moment,
+    empty_scratch,
+    flow,
+    hidden_energy,
+    hold,
+    inelastic,
+    set_material,
+)
 from dlo_gym.rod._kernels_rates import (
     accelerations,
     angular_velocities,
@@ -59,28 +69,6 @@ LARGEST_GAIN = 0.02  # of energy in a step, relative to the kinetic energy: beyo
 LARGEST_IMBALANCE = 0.2  # of energy against the work of moving clamps
 
 
-class Motion(NamedTuple):
-    """What moves, and what slows it.
-
-    Attributes:
-        mass: (3 n + 1,) of the places: m [kg] of nodes, J = m r^2 / 4 [kg m^2] of directors.
-        external: damping proportional to mass [1/s].
-        internal: damping proportional to stiffness [s].
-        creep: share of the bending and twisting stiffness that relaxes [-].
-        relaxation: its time constant [s].
-        yields: whether the rod bends plastically.
-        rest_curvature: (n + 1, 3) kappa0 of the rod as made [1/m].
-    """
-
-    mass: np.ndarray
-    external: float
-    internal: float
-    creep: float
-    relaxation: float
-    yields: bool
-    rest_curvature: np.ndarray
-
-
 class Plan(NamedTuple):
     """How to step: ``steps`` equal steps over ``duration`` [s] unless they must be shorter.
 
@@ -97,147 +85,6 @@ class Plan(NamedTuple):
     tolerance: float
 
 
-class Moment(NamedTuple):
-    """Shape and motion at one time.
-
-    Attributes:
-        places: (3 n + 1, 3) nodes [m] and directors [-].
-        speeds: (3 n + 1, 3) of places [1/s].
-        strain: (2 n + 1, 3) of elements, curvature of nodes; kept for inelastic rods only.
-        plastic: (n + 1, 2) plastic curvature [1/m].
-        creep: (n + 1, 3) curvature at which the relaxing part of the stiffness rests [1/m].
-        q: (n, 4) quaternions of the elements.
-        w: (n, 3) their angular velocities [rad/s].
-    """
-
-    places: np.ndarray
-    speeds: np.ndarray
-    strain: np.ndarray
-    plastic: np.ndarray
-    creep: np.ndarray
-    q: np.ndarray
-    w: np.ndarray
-
-
-class Scratch(NamedTuple):
-    """What one step needs beside the moment it moves."""
-
-    before: Moment
-    middle: Moment
-    base: Moment
-    stage: System
-    rotations: np.ndarray
-    clamps: np.ndarray
-    twist: np.ndarray
-    frames: np.ndarray
-
-
-@njit(cache=True)
-def _empty_moment(n):
-    return Moment(
-        np.empty((3 * n + 1, 3)), np.zeros((3 * n + 1, 3)), np.zeros((2 * n + 1, 3)),
-        np.zeros((n + 1, 2)),
-        np.zeros((n + 1, 3)),
-        np.empty((n, 4)), np.empty((n, 3)),
-    )  # fmt: skip
-
-
-@njit(cache=True)
-def _scratch(system, n):
-    rod = system.rod
-    stage_rod = RodArrays(
-        rod.rest_length, rod.shear.copy(), rod.rest_strain.copy(), rod.bending.copy(),
-        rod.rest_curvature.copy(), rod.voronoi_length, rod.forces,
-        rod.plastic, rod.yield_moment, rod.hardening, np.zeros((n + 1, 3)), np.zeros((n + 1, 3)),
-    )  # fmt: skip
-    stage = System(stage_rod, Inertia(np.empty(3 * n + 1), np.empty((3 * n + 1, 3))))
-    return Scratch(
-        _empty_moment(n), _empty_moment(n), _empty_moment(n), stage,
-        np.empty((2, 3, 3)), np.empty((2, 3)), np.zeros(12), np.empty((2, 4)),
-    )  # fmt: skip
-
-
-@njit(cache=True)
-def _combine(a, A, b, B, out):
-    """Update ``out`` to a A + b B, all of one shape; ``out`` may be one of them."""
-    for i in range(A.shape[0]):
-        for k in range(A.shape[1]):
-            out[i, k] = a * A[i, k] + b * B[i, k]
-
-
-@njit(cache=True)
-def _copy(source, out):
-    """Update the moment ``out`` with ``source``."""
-    _combine(1.0, source.places, 0.0, source.places, out.places)
-    _combine(1.0, source.speeds, 0.0, source.speeds, out.speeds)
-    _combine(1.0, source.strain, 0.0, source.strain, out.strain)
-    _combine(1.0, source.plastic, 0.0, source.plastic, out.plastic)
-    _combine(1.0, source.creep, 0.0, source.creep, out.creep)
-    _combine(1.0, source.w, 0.0, source.w, out.w)
-    _combine(1.0, source.q, 0.0, source.q, out.q)
-
-
-@njit(cache=True)
-def _hold(path, ends, now):
-    """Update the held nodes' speeds to the clamps'."""
-    n = now.q.shape[0]
-    for k in range(3):
-        now.speeds[0, k] = path.velocity[k]
-        if ends.right_held:
-            now.speeds[n, k] = path.velocity[6 + k]
-
-
-@njit(cache=True)
-def _inelastic(motion):
-    return motion.internal > 0.0 or motion.creep > 0.0 or motion.yields
-
-
-@njit(cache=True)
-def _set_material(system, motion, now):
-    """Update the system's plastic and rest curvature to those of ``now``."""
-    _combine(1.0, now.plastic, 0.0, now.plastic, system.rod.plastic)
-    rest = system.rod.rest_curvature
-    _combine(1.0, motion.rest_curvature, motion.creep, now.creep, rest)
-
-
-@njit(cache=True)
-def _bent(motion, now, out):
-    """Update ``out`` (n + 1, 3) to the elastic curvature kappa - kappa0 - plastic."""
-    n = now.q.shape[0]
-    _combine(1.0, now.strain[n:], -1.0, motion.rest_curvature, out)
-    for i in range(n + 1):
-        for k in range(2):
-            out[i, k] -= now.plastic[i, k]
-
-
-@njit(cache=True)
-def _flow(system, motion, s, base, stage, ends, now):
-    """Update the moment's plastic curvature, creep and strain at the end of a stage."""
-    n = now.q.shape[0]
-    kappa = now.strain[n:]
-    strains(system.rod, now.places, now.q, ends, now.strain[:n], kappa)
-    if motion.yields:
-        flow_plastically(stage.rod, kappa, now.plastic)
-    if motion.creep > 0.0:
-        _bent(motion, now, now.creep)
-        a = s / motion.relaxation
-        _combine(1.0 / (1.0 + a), base.creep, a / (1.0 + a), now.creep, now.creep)
-    _set_material(system, motion, now)
-
-
-@njit(cache=True)
-def hidden_energy(motion, rod, creep, plastic):
-    """Energy [J] of hardening and of the relaxing stiffness that ``assemble`` leaves out."""
-    energy = 0.0
-    for i in range(plastic.shape[0]):
-        for k in range(2):
-            energy += 0.5 * rod.voronoi_length[i] * rod.hardening[i] * plastic[i, k] ** 2
-        for k in range(3):
-            stiffness = motion.creep * (1.0 - motion.creep) * rod.bending[i, k]
-            energy += 0.5 * rod.voronoi_length[i] * stiffness * creep[i, k] ** 2
-    return energy
-
-
 @njit(cache=True)
 def _set_stage(rod, motion, s, base, ends, stage):
     """Update ``stage`` to springs and viscous stiffness; ``base`` holds b and c."""
@@ -249,21 +96,21 @@ def _set_stage(rod, motion, s, base, ends, stage):
     if ends.right_held:
         stage.inertia.weight[n] = 0.0
     # Where the damped, unloaded motion ends.
-    _combine(1.0, base.places, s / (1.0 + damping), base.speeds, stage.inertia.centre)
-    if not _inelastic(motion):
+    combine(1.0, base.places, s / (1.0 + damping), base.speeds, stage.inertia.centre)
+    if not inelastic(motion):
         return
     share = motion.internal / s
-    _combine(1.0 + share, rod.shear, 0.0, rod.shear, stage.rod.shear)
+    combine(1.0 + share, rod.shear, 0.0, rod.shear, stage.rod.shear)
     shift = share / (1.0 + share)
-    _combine(1.0 - shift, rod.rest_strain, shift, base.strain, stage.rod.rest_strain)
-    _combine(share, rod.bending, 0.0, rod.bending, stage.rod.viscous)
-    _combine(1.0, base.strain[n:], 0.0, base.strain[n:], stage.rod.viscous_centre)
+    combine(1.0 - shift, rod.rest_strain, shift, base.strain, stage.rod.rest_strain)
+    combine(share, rod.bending, 0.0, rod.bending, stage.rod.viscous)
+    combine(1.0, base.strain[n:], 0.0, base.strain[n:], stage.rod.viscous_centre)
     # M = B (k - c k_v) for k = kappa - kappa0 - plastic, k_v = (b_v + a k) / (1 + a).
     a = s / motion.relaxation
     softer = 1.0 - motion.creep * a / (1.0 + a)
     crept = motion.creep / ((1.0 + a) * softer)
-    _combine(softer, rod.bending, 0.0, rod.bending, stage.rod.bending)
-    _combine(1.0, motion.rest_curvature, crept, base.creep, stage.rod.rest_curvature)
+    combine(softer, rod.bending, 0.0, rod.bending, stage.rod.bending)
+    combine(1.0, motion.rest_curvature, crept, base.creep, stage.rod.rest_curvature)
 
 
 @njit(cache=True)
@@ -308,10 +155,10 @@ def _solve_stage(system, motion, path, s, time, ends, now, scratch, limits, work
         if ends.right_held:
             x[n, k] = scratch.clamps[1, k]
     directors(now.q, now.places)
-    _combine(1.0 / s, now.places, -1.0 / s, base.places, now.speeds)
-    _hold(path, ends, now)
-    if _inelastic(motion):
-        _flow(system, motion, s, base, stage, ends, now)
+    combine(1.0 / s, now.places, -1.0 / s, base.places, now.speeds)
+    hold(path, ends, now)
+    if inelastic(motion):
+        flow(system, motion, s, base, stage, ends, now)
     return status
 
 
@@ -332,32 +179,32 @@ def _trapezoid_base(system, motion, path, s, ends, now, scratch, work):
         strain_rates(rod, x, now.q, ends, v, now.w, spin, base.strain)
         # The stress S eta d(strain)/dt as that of springs.
         eta = motion.internal
-        _combine(1.0, rod.shear, 0.0, rod.shear, stage.rod.shear)
-        _combine(1.0, rod.bending, 0.0, rod.bending, stage.rod.bending)
-        _combine(1.0, rod.rest_strain, -eta, base.strain, stage.rod.rest_strain)
-        _combine(1.0, rod.rest_curvature, 0.0, rod.rest_curvature, stage.rod.rest_curvature)
-        _combine(eta / s, rod.bending, 0.0, rod.bending, stage.rod.viscous)
-        _combine(1.0, now.strain[n:], -s, base.strain[n:], stage.rod.viscous_centre)
-        _combine(1.0, now.strain, s, base.strain, base.strain)
+        combine(1.0, rod.shear, 0.0, rod.shear, stage.rod.shear)
+        combine(1.0, rod.bending, 0.0, rod.bending, stage.rod.bending)
+        combine(1.0, rod.rest_strain, -eta, base.strain, stage.rod.rest_strain)
+        combine(1.0, rod.rest_curvature, 0.0, rod.rest_curvature, stage.rod.rest_curvature)
+        combine(eta / s, rod.bending, 0.0, rod.bending, stage.rod.viscous)
+        combine(1.0, now.strain[n:], -s, base.strain[n:], stage.rod.viscous_centre)
+        combine(1.0, now.strain, s, base.strain, base.strain)
         assemble(System(stage.rod, system.inertia), x, now.q, ends, work, False)
     else:
         assemble(system, x, now.q, ends, work, False)
     if motion.creep > 0.0:
         a = s / motion.relaxation
-        _bent(motion, now, base.creep)
-        _combine(1.0 - a, now.creep, a, base.creep, base.creep)
+        bent(motion, now, base.creep)
+        combine(1.0 - a, now.creep, a, base.creep, base.creep)
     accelerations(motion, now.q, now.w, now.speeds, work.gradient, base.speeds)
-    _combine(1.0, now.speeds, s, base.speeds, base.speeds)
-    _combine(1.0, now.places, s, now.speeds, base.places)
+    combine(1.0, now.speeds, s, base.speeds, base.speeds)
+    combine(1.0, now.places, s, now.speeds, base.places)
 
 
 @njit(cache=True)
 def _bdf_base(before, middle, base):
     """Update ``base`` to b = p Y_g - r y and c = p V_g - r v."""
-    _combine(BDF_NEW, middle.places, -BDF_OLD, before.places, base.places)
-    _combine(BDF_NEW, middle.speeds, -BDF_OLD, before.speeds, base.speeds)
-    _combine(BDF_NEW, middle.strain, -BDF_OLD, before.strain, base.strain)
-    _combine(BDF_NEW, middle.creep, -BDF_OLD, before.creep, base.creep)
+    combine(BDF_NEW, middle.places, -BDF_OLD, before.places, base.places)
+    combine(BDF_NEW, middle.speeds, -BDF_OLD, before.speeds, base.speeds)
+    combine(BDF_NEW, middle.strain, -BDF_OLD, before.strain, base.strain)
+    combine(BDF_NEW, middle.creep, -BDF_OLD, before.creep, base.creep)
 
 
 @njit(cache=True)
@@ -390,12 +237,12 @@ def _step(system, motion, path, plan, time, h, ends, now, scratch, limits, work)
     s = h if stages == 1 else 0.5 * GAMMA * h
     for stage in range(stages):
         if stages == 1:
-            _copy(before, scratch.base)
+            copy_moment(before, scratch.base)
         elif stage == 0:
             _trapezoid_base(system, motion, path, s, ends, now, scratch, work)
             clamp_work += 0.5 * (h - s) * _power(ends, path, rotations, work)
         else:
-            _copy(now, middle)
+            copy_moment(now, middle)
             clamp_work += 0.5 * (h - s) * _power(ends, path, rotations, work)
             _bdf_base(before, middle, scratch.base)
         end = time + (h if stage == stages - 1 else GAMMA * h)
@@ -428,18 +275,18 @@ def advance(system, motion, path, ends, x, q, v, w, creep, plan, limits, work):
     from the velocities, so that between clamps that hold still the total energy never grows.
     """
     n = q.shape[0]
-    now, scratch = _empty_moment(n), _scratch(system, n)
+    now, scratch = empty_moment(n), empty_scratch(system, n)
     before = scratch.before
     now.places[: n + 1], now.speeds[: n + 1] = x, v
     now.q[:], now.w[:] = q, w
     directors(now.q, now.places)
     director_velocities(now.q, now.w, now.speeds)
-    _hold(path, ends, now)
+    hold(path, ends, now)
     now.creep[:] = creep
-    if _inelastic(motion):
+    if inelastic(motion):
         strains(system.rod, now.places, now.q, ends, now.strain[:n], now.strain[n:])
         flow_plastically(system.rod, now.strain[n:], now.plastic)
-        _set_material(system, motion, now)
+        set_material(system, motion, now)
     still = True
     for k in range(12):
         still = still and path.velocity[k] == 0.0
@@ -453,12 +300,12 @@ def advance(system, motion, path, ends, x, q, v, w, creep, plan, limits, work):
         final = h > (plan.duration - time) * (1.0 - 1e-9)
         if final:
             h = plan.duration - time
-        _copy(now, before)
+        copy_moment(now, before)
         status, error, clamp_work = _step(
             system, motion, path, plan, time, h, ends, now, scratch, limits, work
         )
         accepted = status == CONVERGED
-        new_stored, new_kinetic, growth = stored, kinetic, 0.5
+        new_stored, new_kinetic, gain, growth = stored, kinetic, 0.0, 0.5
         if accepted:
             new_stored = assemble(system, now.places[: n + 1], now.q, ends, work, False)
             new_stored += hidden_energy(motion, system.rod, now.creep, now.plastic)
@@ -477,8 +324,8 @@ def advance(system, motion, path, ends, x, q, v, w, creep, plan, limits, work):
             if gain > slack:
                 accepted, growth = False, min(growth, 0.5)
         if not accepted:
-            _copy(before, now)
-            _set_material(system, motion, now)
+            copy_moment(before, now)
+            set_material(system, motion, now)
             ends.frames[:] = frames
             h *= growth
             if h < SMALLEST_STEP * full:
@@ -487,8 +334,8 @@ def advance(system, motion, path, ends, x, q, v, w, creep, plan, limits, work):
             continue
         if still and gain > 0.0:
             scale = sqrt(max(0.0, 1.0 - gain / new_kinetic)) if new_kinetic > 0.0 else 0.0
-            _combine(scale, now.speeds, 0.0, now.speeds, now.speeds)
-            _combine(scale, now.w, 0.0, now.w, now.w)
+            combine(scale, now.speeds, 0.0, now.speeds, now.speeds)
+            combine(scale, now.w, 0.0, now.w, now.w)
             new_kinetic *= scale * scale
         stored, kinetic = new_stored, new_kinetic
         frames[:] = ends.frames

@@ -5,7 +5,8 @@ from math import ceil, isfinite
 import numpy as np
 
 from dlo_gym.geometry.se3 import Array, matrix_to_quaternion
-from dlo_gym.rod._kernels_dynamics import Motion, Plan
+from dlo_gym.rod._kernels_dynamics import Plan
+from dlo_gym.rod._kernels_moment import Motion
 from dlo_gym.rod._kernels_rates import ClampPath
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.properties import RodProperties, per_element

@@ -14,17 +14,18 @@ from dlo_gym.rod import _kernels_solve as kernels
 from dlo_gym.rod._kernels_assembly import System
 from dlo_gym.rod._kernels_clamps import clamp_frame
 from dlo_gym.rod._kernels_inertia import NO_INERTIA
+from dlo_gym.rod._kernels_moment import hidden_energy
 from dlo_gym.rod._kernels_rates import kinetic_energy
+from dlo_gym.rod.arrays import node_weights, rod_arrays
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.dynamics import clamp_path, motion_of, plan_of
 from dlo_gym.rod.initial_shapes import hanging
-from dlo_gym.rod.properties import RodProperties, per_element
+from dlo_gym.rod.properties import RodProperties
 from dlo_gym.rod.sensitivity import parameter_sensitivity
 from dlo_gym.rod.state import RodMemory, RodState
 
 GRAVITY = (0.0, 0.0, -9.81)
 TOLERANCE = 1e-9  # residual relative to the rod's own weight and stiffness
-RIGID_JOINT = 1e-3  # of an element: the piece between clamp and element when it holds the element
 LARGEST_STRAIN = 0.25  # beside what a few times the rod's own weight stretches
 LARGEST_BEND = 2.4  # between neighbouring elements [rad]
 LARGEST_MOVE = (0.08, 0.3)  # of one sub-step: translation per rod length, rotation [rad]
@@ -69,7 +70,7 @@ class CosseratRod:
         self.gravity = np.asarray(gravity, dtype=np.float64)
         if self.gravity.shape != (3,) or not np.isfinite(self.gravity).all():
             raise ValueError(f"gravity: expected three finite numbers [m/s^2], got {gravity}")
-        self._arrays = _arrays(properties, n_elements, self.gravity, clamp)
+        self._arrays = rod_arrays(properties, n_elements, self.gravity, clamp)
         self._system = System(self._arrays, NO_INERTIA)
         self._motion = motion_of(properties, n_elements, self._arrays.rest_curvature.copy())
         stiffness = float(self._arrays.bending[:, 0].mean())
@@ -109,7 +110,7 @@ class CosseratRod:
             raise ValueError(
                 f"forces: expected finite values of shape ({self.n_nodes}, 3), got {forces.shape}"
             )
-        weight = _weight(self.properties, self.n_elements, self.gravity)
+        weight = node_weights(self.properties, self.n_elements, self.gravity)
         self._arrays = self._arrays._replace(forces=weight + forces)
         self._system = self._system._replace(rod=self._arrays)
 
@@ -305,7 +306,7 @@ class CosseratRod:
         the plastic curvature it had before its last solve.
         """
         self._settled("parameter_sensitivity")
-        weight = _weight(self.properties, self.n_elements, self.gravity)
+        weight = node_weights(self.properties, self.n_elements, self.gravity)
         return self._of_nodes(
             parameter_sensitivity(self._system, weight, self._x, self._q, self._ends, self._work)
         )
@@ -349,9 +350,7 @@ class CosseratRod:
         return (
             potential
             - lost
-            + dynamics_kernels.hidden_energy(
-                self._motion, self._arrays, self._creep, self._arrays.plastic
-            )
+            + hidden_energy(self._motion, self._arrays, self._creep, self._arrays.plastic)
         )
 
     def _check_reach(self, boundary: BoundaryPoses) -> None:
@@ -457,63 +456,6 @@ class CosseratRod:
             wrenches[1, :3] = self._work.gradient[-3:]
             wrenches[1, 3:] = self._rotations[1] @ self._work.clamp_terms[1, 0]
         return wrenches
-
-
-def _arrays(
-    properties: RodProperties, n: int, gravity: Array, clamp: str
-) -> energy_kernels.RodArrays:
-    """The kernels' constants: element values, and their averages at the nodes between."""
-    rest_length = np.full(n, properties.length / n)
-    shear = np.column_stack(
-        [per_element(properties.shearing_stiffness, n)] * 2
-        + [per_element(properties.stretching_stiffness, n)]
-    )
-    bend = per_element(properties.bending_stiffness, n)
-    twist = per_element(properties.twisting_stiffness, n)
-    elements = np.column_stack([bend, bend, twist])
-    # Two half elements in series: the harmonic mean of their stiffnesses.
-    between = 2.0 / (1.0 / elements[:-1] + 1.0 / elements[1:])
-    rest = np.asarray(properties.rest_curvature, dtype=np.float64)
-    rest = np.broadcast_to(rest, (n - 1, 3))
-    joint = (RIGID_JOINT if clamp == "element" else 0.5) * properties.length / n
-    voronoi = np.full(n + 1, properties.length / n)
-    voronoi[[0, -1]] = joint
-    bending = np.concatenate([elements[:1], between, elements[-1:]])
-    return energy_kernels.RodArrays(
-        rest_length,
-        np.ascontiguousarray(shear),
-        np.zeros((n, 3)),
-        bending,
-        np.concatenate([rest[:1], rest, rest[-1:]]),
-        voronoi,
-        _weight(properties, n, gravity),
-        np.zeros((n + 1, 2)),
-        *_yield(properties, bending),
-        np.zeros((n + 1, 3)),
-        np.zeros((n + 1, 3)),
-    )
-
-
-def _yield(properties: RodProperties, bending: Array) -> tuple[Array, Array]:
-    """Yield moment [N m] and hardening [N m^2] at the nodes; between elements the weaker yields."""
-    n = len(bending) - 1
-    if properties.yield_curvature is None:
-        return np.full(n + 1, np.inf), np.zeros(n + 1)
-    curvature = per_element(properties.yield_curvature, n)
-    at_nodes = np.concatenate([[np.inf], curvature])
-    at_nodes = np.minimum(at_nodes, np.concatenate([curvature, [np.inf]]))
-    # Elastic and plastic compliance in series: a slope h of M(kappa) is H = B h / (1 - h).
-    slope = properties.hardening / (1.0 - properties.hardening)
-    return bending[:, 0] * at_nodes, bending[:, 0] * slope
-
-
-def _weight(properties: RodProperties, n: int, gravity: Array) -> Array:
-    """(n + 1, 3) weight of each node [N]: half of the elements beside it."""
-    mass = per_element(properties.linear_density, n) * properties.length / n
-    nodes = np.zeros(n + 1)
-    nodes[:-1] += 0.5 * mass
-    nodes[1:] += 0.5 * mass
-    return nodes[:, None] * gravity
 
 
 def _frames_along(positions: Array, boundary: BoundaryPoses) -> Array:
