@@ -12,7 +12,8 @@ stage's implicit length, V = (Y - b) / s and V = c + s a(Y), so Y minimises
 TR-BDF2 is L-stable, and its stages are of order 2: stiff stretch, and the directors' constraint,
 which one-step methods of lower stage order answer with order 1, keep the full order. Damping stays
 a quadratic: external -c m V shifts M's springs, and the stress S eta d(strain)/dt of a Kelvin-Voigt
-rod is a stiffness S (1 + eta / s) with a shifted rest strain.
+rod is a stiffness S eta / s that rests at the strain's own b. So is a share of the stiffness that
+relaxes towards the present curvature. Plastic curvature flows within each stage.
 """
 
 from math import sqrt
@@ -23,8 +24,23 @@ from numba import njit
 
 from dlo_gym.rod._kernels_assembly import System, assemble
 from dlo_gym.rod._kernels_banded import factorise
-from dlo_gym.rod._kernels_energy import RodArrays, quaternion_to_columns, strains
-from dlo_gym.rod._kernels_inertia import Inertia
+from dlo_gym.rod._kernels_energy import (
+    flow_plastically,
+    quaternion_to_columns,
+    strains,
+)
+from dlo_gym.rod._kernels_moment import (
+    bent,
+    combine,
+    copy_moment,
+    empty_moment,
+    empty_scratch,
+    flow,
+    hidden_energy,
+    hold,
+    inelastic,
+    set_material,
+)
 from dlo_gym.rod._kernels_rates import (
     accelerations,
     angular_velocities,
@@ -34,7 +50,14 @@ from dlo_gym.rod._kernels_rates import (
     kinetic_energy,
     strain_rates,
 )
-from dlo_gym.rod._kernels_solve import CONVERGED, STALLED, exact_stress, follow, free_range
+from dlo_gym.rod._kernels_solve import (
+    CONVERGED,
+    STALLED,
+    Limits,
+    exact_stress,
+    follow,
+    free_range,
+)
 
 GAMMA = 2.0 - sqrt(2.0)
 BDF_NEW = 1.0 / (GAMMA * (2.0 - GAMMA))
@@ -44,20 +67,6 @@ ERROR = 2.0 * abs(-3.0 * GAMMA**2 + 4.0 * GAMMA - 2.0) / (12.0 * (2.0 - GAMMA))
 SMALLEST_STEP = 1.0 / 1024.0  # of the step that was asked for
 LARGEST_GAIN = 0.02  # of energy in a step, relative to the kinetic energy: beyond, it is halved
 LARGEST_IMBALANCE = 0.2  # of energy against the work of moving clamps
-
-
-class Motion(NamedTuple):
-    """What moves, and what slows it.
-
-    Attributes:
-        mass: (3 n + 1,) of the places: m [kg] of nodes, J = m r^2 / 4 [kg m^2] of directors.
-        external: damping proportional to mass [1/s].
-        internal: damping proportional to stiffness [s].
-    """
-
-    mass: np.ndarray
-    external: float
-    internal: float
 
 
 class Plan(NamedTuple):
@@ -76,96 +85,6 @@ class Plan(NamedTuple):
     tolerance: float
 
 
-class Moment(NamedTuple):
-    """Shape and motion at one time.
-
-    Attributes:
-        places: (3 n + 1, 3) nodes [m] and directors [-].
-        speeds: (3 n + 1, 3) of places [1/s].
-        strain: (2 n + 1, 3) of elements and nodes; kept for internal damping only.
-        q: (n, 4) quaternions of the elements.
-        w: (n, 3) their angular velocities [rad/s].
-    """
-
-    places: np.ndarray
-    speeds: np.ndarray
-    strain: np.ndarray
-    q: np.ndarray
-    w: np.ndarray
-
-
-class Scratch(NamedTuple):
-    """What one step needs beside the moment it moves."""
-
-    before: Moment
-    middle: Moment
-    base: Moment
-    stage: System
-    rotations: np.ndarray
-    clamps: np.ndarray
-    twist: np.ndarray
-    frames: np.ndarray
-
-
-@njit(cache=True)
-def _empty_moment(n):
-    return Moment(
-        np.empty((3 * n + 1, 3)), np.zeros((3 * n + 1, 3)), np.zeros((2 * n + 1, 3)),
-        np.empty((n, 4)), np.empty((n, 3)),
-    )  # fmt: skip
-
-
-@njit(cache=True)
-def _scratch(system, n):
-    rod = system.rod
-    stage_rod = RodArrays(
-        rod.rest_length, rod.shear.copy(), rod.rest_strain.copy(), rod.bending.copy(),
-        rod.rest_curvature.copy(), rod.voronoi_length, rod.forces,
-    )  # fmt: skip
-    stage = System(stage_rod, Inertia(np.empty(3 * n + 1), np.empty((3 * n + 1, 3))))
-    return Scratch(
-        _empty_moment(n), _empty_moment(n), _empty_moment(n), stage,
-        np.empty((2, 3, 3)), np.empty((2, 3)), np.zeros(12), np.empty((2, 4)),
-    )  # fmt: skip
-
-
-@njit(cache=True)
-def _combine(a, A, b, B, out):
-    """Update ``out`` to a A + b B, all (m, 3); ``out`` may be one of them."""
-    for i in range(A.shape[0]):
-        for k in range(3):
-            out[i, k] = a * A[i, k] + b * B[i, k]
-
-
-@njit(cache=True)
-def _copy(source, out):
-    """Update the moment ``out`` with ``source``."""
-    _combine(1.0, source.places, 0.0, source.places, out.places)
-    _combine(1.0, source.speeds, 0.0, source.speeds, out.speeds)
-    _combine(1.0, source.strain, 0.0, source.strain, out.strain)
-    _combine(1.0, source.w, 0.0, source.w, out.w)
-    for e in range(source.q.shape[0]):
-        for k in range(4):
-            out.q[e, k] = source.q[e, k]
-
-
-@njit(cache=True)
-def _hold(path, ends, now):
-    """Update the held nodes' speeds to the clamps'."""
-    n = now.q.shape[0]
-    for k in range(3):
-        now.speeds[0, k] = path.velocity[k]
-        if ends.right_held:
-            now.speeds[n, k] = path.velocity[6 + k]
-
-
-@njit(cache=True)
-def _set_strain(rod, ends, now):
-    """Update the moment's strain."""
-    n = now.q.shape[0]
-    strains(rod, now.places, now.q, ends, now.strain[:n], now.strain[n:])
-
-
 @njit(cache=True)
 def _set_stage(rod, motion, s, base, ends, stage):
     """Update ``stage`` to springs and viscous stiffness; ``base`` holds b and c."""
@@ -177,15 +96,21 @@ def _set_stage(rod, motion, s, base, ends, stage):
     if ends.right_held:
         stage.inertia.weight[n] = 0.0
     # Where the damped, unloaded motion ends.
-    _combine(1.0, base.places, s / (1.0 + damping), base.speeds, stage.inertia.centre)
-    if motion.internal == 0.0:
+    combine(1.0, base.places, s / (1.0 + damping), base.speeds, stage.inertia.centre)
+    if not inelastic(motion):
         return
     share = motion.internal / s
-    stiffer, shift = 1.0 + share, share / (1.0 + share)
-    _combine(stiffer, rod.shear, 0.0, rod.shear, stage.rod.shear)
-    _combine(stiffer, rod.bending, 0.0, rod.bending, stage.rod.bending)
-    _combine(1.0 / stiffer, rod.rest_strain, shift, base.strain, stage.rod.rest_strain)
-    _combine(1.0 / stiffer, rod.rest_curvature, shift, base.strain[n:], stage.rod.rest_curvature)
+    combine(1.0 + share, rod.shear, 0.0, rod.shear, stage.rod.shear)
+    shift = share / (1.0 + share)
+    combine(1.0 - shift, rod.rest_strain, shift, base.strain, stage.rod.rest_strain)
+    combine(share, rod.bending, 0.0, rod.bending, stage.rod.viscous)
+    combine(1.0, base.strain[n:], 0.0, base.strain[n:], stage.rod.viscous_centre)
+    # M = B (k - c k_v) for k = kappa - kappa0 - plastic, k_v = (b_v + a k) / (1 + a).
+    a = s / motion.relaxation
+    softer = 1.0 - motion.creep * a / (1.0 + a)
+    crept = motion.creep / ((1.0 + a) * softer)
+    combine(softer, rod.bending, 0.0, rod.bending, stage.rod.bending)
+    combine(1.0, motion.rest_curvature, crept, base.creep, stage.rod.rest_curvature)
 
 
 @njit(cache=True)
@@ -221,16 +146,19 @@ def _solve_stage(system, motion, path, s, time, ends, now, scratch, limits, work
     first, last = free_range(n, ends.right_held)
     factorise(work.band, first, last)
     _follow_clamps(path, time, ends, now, scratch)
-    status, _ = follow(stage, x, now.q, ends, scratch.twist, scratch.rotations, limits, work)
+    # Rounding errors grow with the stiffness.
+    residual = limits.residual * (1.0 + motion.internal / s)
+    looser = Limits(residual, limits.force, limits.torque)
+    status, _ = follow(stage, x, now.q, ends, scratch.twist, scratch.rotations, looser, work)
     for k in range(3):
         x[0, k] = scratch.clamps[0, k]
         if ends.right_held:
             x[n, k] = scratch.clamps[1, k]
     directors(now.q, now.places)
-    _combine(1.0 / s, now.places, -1.0 / s, base.places, now.speeds)
-    _hold(path, ends, now)
-    if motion.internal > 0.0:
-        _set_strain(system.rod, ends, now)
+    combine(1.0 / s, now.places, -1.0 / s, base.places, now.speeds)
+    hold(path, ends, now)
+    if inelastic(motion):
+        flow(system, motion, s, base, stage, ends, now)
     return status
 
 
@@ -249,27 +177,34 @@ def _trapezoid_base(system, motion, path, s, ends, now, scratch, work):
                 for j in range(3):
                     spin[side, k] += scratch.rotations[side, j, k] * path.velocity[6 * side + 3 + j]
         strain_rates(rod, x, now.q, ends, v, now.w, spin, base.strain)
-        # The stress S (gamma + eta d gamma/dt) as that of a shifted rest strain.
+        # The stress S eta d(strain)/dt as that of springs.
         eta = motion.internal
-        _combine(1.0, rod.shear, 0.0, rod.shear, stage.rod.shear)
-        _combine(1.0, rod.bending, 0.0, rod.bending, stage.rod.bending)
-        _combine(1.0, rod.rest_strain, -eta, base.strain, stage.rod.rest_strain)
-        _combine(1.0, rod.rest_curvature, -eta, base.strain[n:], stage.rod.rest_curvature)
-        _combine(1.0, now.strain, s, base.strain, base.strain)
+        combine(1.0, rod.shear, 0.0, rod.shear, stage.rod.shear)
+        combine(1.0, rod.bending, 0.0, rod.bending, stage.rod.bending)
+        combine(1.0, rod.rest_strain, -eta, base.strain, stage.rod.rest_strain)
+        combine(1.0, rod.rest_curvature, 0.0, rod.rest_curvature, stage.rod.rest_curvature)
+        combine(eta / s, rod.bending, 0.0, rod.bending, stage.rod.viscous)
+        combine(1.0, now.strain[n:], -s, base.strain[n:], stage.rod.viscous_centre)
+        combine(1.0, now.strain, s, base.strain, base.strain)
         assemble(System(stage.rod, system.inertia), x, now.q, ends, work, False)
     else:
         assemble(system, x, now.q, ends, work, False)
+    if motion.creep > 0.0:
+        a = s / motion.relaxation
+        bent(motion, now, base.creep)
+        combine(1.0 - a, now.creep, a, base.creep, base.creep)
     accelerations(motion, now.q, now.w, now.speeds, work.gradient, base.speeds)
-    _combine(1.0, now.speeds, s, base.speeds, base.speeds)
-    _combine(1.0, now.places, s, now.speeds, base.places)
+    combine(1.0, now.speeds, s, base.speeds, base.speeds)
+    combine(1.0, now.places, s, now.speeds, base.places)
 
 
 @njit(cache=True)
 def _bdf_base(before, middle, base):
     """Update ``base`` to b = p Y_g - r y and c = p V_g - r v."""
-    _combine(BDF_NEW, middle.places, -BDF_OLD, before.places, base.places)
-    _combine(BDF_NEW, middle.speeds, -BDF_OLD, before.speeds, base.speeds)
-    _combine(BDF_NEW, middle.strain, -BDF_OLD, before.strain, base.strain)
+    combine(BDF_NEW, middle.places, -BDF_OLD, before.places, base.places)
+    combine(BDF_NEW, middle.speeds, -BDF_OLD, before.speeds, base.speeds)
+    combine(BDF_NEW, middle.strain, -BDF_OLD, before.strain, base.strain)
+    combine(BDF_NEW, middle.creep, -BDF_OLD, before.creep, base.creep)
 
 
 @njit(cache=True)
@@ -302,12 +237,12 @@ def _step(system, motion, path, plan, time, h, ends, now, scratch, limits, work)
     s = h if stages == 1 else 0.5 * GAMMA * h
     for stage in range(stages):
         if stages == 1:
-            _copy(before, scratch.base)
+            copy_moment(before, scratch.base)
         elif stage == 0:
             _trapezoid_base(system, motion, path, s, ends, now, scratch, work)
             clamp_work += 0.5 * (h - s) * _power(ends, path, rotations, work)
         else:
-            _copy(now, middle)
+            copy_moment(now, middle)
             clamp_work += 0.5 * (h - s) * _power(ends, path, rotations, work)
             _bdf_base(before, middle, scratch.base)
         end = time + (h if stage == stages - 1 else GAMMA * h)
@@ -332,23 +267,26 @@ def _step(system, motion, path, plan, time, h, ends, now, scratch, limits, work)
 
 
 @njit(cache=True)
-def advance(system, motion, path, ends, x, q, v, w, plan, limits, work):
-    """Update x, q, v, w along ``path``; returns (status, time reached [s], energy [J]).
+def advance(system, motion, path, ends, x, q, v, w, creep, plan, limits, work):
+    """Update x, q, v, w, creep along ``path``; returns (status, time reached [s], energy [J]).
 
     Steps are shortened where Newton's method fails, where the error estimate exceeds the
     tolerance, or where energy appears from nowhere; what little is left of such a gain is taken
     from the velocities, so that between clamps that hold still the total energy never grows.
     """
     n = q.shape[0]
-    now, scratch = _empty_moment(n), _scratch(system, n)
+    now, scratch = empty_moment(n), empty_scratch(system, n)
     before = scratch.before
     now.places[: n + 1], now.speeds[: n + 1] = x, v
     now.q[:], now.w[:] = q, w
     directors(now.q, now.places)
     director_velocities(now.q, now.w, now.speeds)
-    _hold(path, ends, now)
-    if motion.internal > 0.0:
-        _set_strain(system.rod, ends, now)
+    hold(path, ends, now)
+    now.creep[:] = creep
+    if inelastic(motion):
+        strains(system.rod, now.places, now.q, ends, now.strain[:n], now.strain[n:])
+        flow_plastically(system.rod, now.strain[n:], now.plastic)
+        set_material(system, motion, now)
     still = True
     for k in range(12):
         still = still and path.velocity[k] == 0.0
@@ -356,19 +294,21 @@ def advance(system, motion, path, ends, x, q, v, w, plan, limits, work):
     h, time, status = full, 0.0, CONVERGED
     frames = ends.frames.copy()
     stored = assemble(system, now.places[: n + 1], now.q, ends, work, False)
+    stored += hidden_energy(motion, system.rod, now.creep, now.plastic)
     kinetic = kinetic_energy(motion, now.speeds, now.w)
     while time < plan.duration:
         final = h > (plan.duration - time) * (1.0 - 1e-9)
         if final:
             h = plan.duration - time
-        _copy(now, before)
+        copy_moment(now, before)
         status, error, clamp_work = _step(
             system, motion, path, plan, time, h, ends, now, scratch, limits, work
         )
         accepted = status == CONVERGED
-        new_stored, new_kinetic, growth = stored, kinetic, 0.5
+        new_stored, new_kinetic, gain, growth = stored, kinetic, 0.0, 0.5
         if accepted:
             new_stored = assemble(system, now.places[: n + 1], now.q, ends, work, False)
+            new_stored += hidden_energy(motion, system.rod, now.creep, now.plastic)
             new_kinetic = kinetic_energy(motion, now.speeds, now.w)
             gain = new_stored + new_kinetic - stored - kinetic - clamp_work
             growth = 2.0
@@ -384,7 +324,8 @@ def advance(system, motion, path, ends, x, q, v, w, plan, limits, work):
             if gain > slack:
                 accepted, growth = False, min(growth, 0.5)
         if not accepted:
-            _copy(before, now)
+            copy_moment(before, now)
+            set_material(system, motion, now)
             ends.frames[:] = frames
             h *= growth
             if h < SMALLEST_STEP * full:
@@ -393,13 +334,13 @@ def advance(system, motion, path, ends, x, q, v, w, plan, limits, work):
             continue
         if still and gain > 0.0:
             scale = sqrt(max(0.0, 1.0 - gain / new_kinetic)) if new_kinetic > 0.0 else 0.0
-            _combine(scale, now.speeds, 0.0, now.speeds, now.speeds)
-            _combine(scale, now.w, 0.0, now.w, now.w)
+            combine(scale, now.speeds, 0.0, now.speeds, now.speeds)
+            combine(scale, now.w, 0.0, now.w, now.w)
             new_kinetic *= scale * scale
         stored, kinetic = new_stored, new_kinetic
         frames[:] = ends.frames
         time = plan.duration if final else time + h
         h = min(full, h * growth)
     x[:], v[:] = now.places[: n + 1], now.speeds[: n + 1]
-    q[:], w[:] = now.q, now.w
+    q[:], w[:], creep[:] = now.q, now.w, now.creep
     return status, time, stored

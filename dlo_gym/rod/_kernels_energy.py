@@ -30,6 +30,11 @@ class RodArrays(NamedTuple):
         rest_curvature: (n + 1, 3) kappa0 [1/m].
         voronoi_length: (n + 1,) D [m]; at the ends the length of rod between clamp and element.
         forces: (n + 1, 3) weight and other dead loads on the nodes [N].
+        plastic: (n + 1, 2) plastic curvature about d1 and d2 before this solve [1/m].
+        yield_moment: (n + 1,) [N m]; infinite where the rod stays elastic.
+        hardening: (n + 1,) moment that each plastic curvature adds to resist it [N m^2].
+        viscous: (n + 1, 3) stiffness of the springs that stand for internal damping [N m^2].
+        viscous_centre: (n + 1, 3) curvature and twist where they rest [1/m].
     """
 
     rest_length: np.ndarray
@@ -39,6 +44,11 @@ class RodArrays(NamedTuple):
     rest_curvature: np.ndarray
     voronoi_length: np.ndarray
     forces: np.ndarray
+    plastic: np.ndarray
+    yield_moment: np.ndarray
+    hardening: np.ndarray
+    viscous: np.ndarray
+    viscous_centre: np.ndarray
 
 
 class Ends(NamedTuple):
@@ -151,21 +161,60 @@ def log_factor(w):
 
 
 @njit(cache=True)
-def _bending(q, B, rest, D, grad_a, grad_b, H_aa, H_bb, H_ab, with_hessian):
-    """Energy of one bend; update its derivatives by the turns a and b of the frames it joins.
+def plastic_flow(m0, m1, B, plastic, yield_moment, hardening):
+    """Direction and amount of plastic curvature under the elastic trial moment (m0, m1).
+
+    Radial return with linear kinematic hardening (Simo and Hughes 1998, 3.3): the minimum over
+    the flow of elastic energy + H |plastic|^2 / 2 + yield moment |flow|.
+    """
+    s0, s1 = m0 - hardening * plastic[0], m1 - hardening * plastic[1]
+    size = sqrt(s0 * s0 + s1 * s1)
+    return s0 / size, s1 / size, (size - yield_moment) / (B + hardening), size
+
+
+@njit(cache=True)
+def _bending(q, rod, i, grad_a, grad_b, H_aa, H_bb, H_ab, with_hessian):
+    """Energy of the bend at node i; updates its derivatives by turns a and b of the frames beside.
 
     ``q`` (4,) is the relative quaternion; a and b act as exp(-a/2) q exp(b/2).
     """
+    B, rest, D, plastic = (
+        rod.bending[i],
+        rod.rest_curvature[i],
+        rod.voronoi_length[i],
+        rod.plastic[i],
+    )
     w, v0, v1, v2 = q[0], q[1], q[2], q[3]
     g, dg, ddg = log_factor(w)
-    v = (v0, v1, v2)
-    m0 = B[0] * (g * v0 / D - rest[0])
-    m1 = B[1] * (g * v1 / D - rest[1])
+    m0 = B[0] * (g * v0 / D - rest[0] - plastic[0])
+    m1 = B[1] * (g * v1 / D - rest[1] - plastic[1])
     m2 = B[2] * (g * v2 / D - rest[2])
-    m = (m0, m1, m2)
+    B00, B01, B11 = B[0], 0.0, B[1]
     energy = 0.0
-    for i in range(3):
-        energy += 0.5 * D * m[i] * m[i] / B[i]
+    yield_moment, hardening = rod.yield_moment[i], rod.hardening[i]
+    s0, s1 = m0 - hardening * plastic[0], m1 - hardening * plastic[1]
+    if s0 * s0 + s1 * s1 > yield_moment * yield_moment:
+        f0, f1, flow, size = plastic_flow(m0, m1, B[0], plastic, yield_moment, hardening)
+        m0 -= B[0] * flow * f0
+        m1 -= B[0] * flow * f1
+        along = f0 * plastic[0] + f1 * plastic[1] + 0.5 * flow
+        energy += D * flow * (yield_moment + hardening * along)
+        # Consistent tangent B (I - B / (B + H) f f - B flow / size (I - f f)).
+        across = B[0] * flow / size
+        less = B[0] / (B[0] + hardening) - across
+        B00 = B[0] * (1.0 - across - less * f0 * f0)
+        B11 = B[0] * (1.0 - across - less * f1 * f1)
+        B01 = -B[0] * less * f0 * f1
+    energy += 0.5 * D * (m0 * m0 / B[0] + m1 * m1 / B[1] + m2 * m2 / B[2])
+    V, centre = rod.viscous[i], rod.viscous_centre[i]
+    r0, r1, r2 = g * v0 / D - centre[0], g * v1 / D - centre[1], g * v2 / D - centre[2]
+    energy += 0.5 * D * (V[0] * r0 * r0 + V[1] * r1 * r1 + V[2] * r2 * r2)
+    m0 += V[0] * r0
+    m1 += V[1] * r1
+    m2 += V[2] * r2
+    m = (m0, m1, m2)
+    diagonal = (B00 + V[0], B11 + V[1], B[2] + V[2])
+    Bv = (diagonal[0] * v0 + B01 * v1, B01 * v0 + diagonal[1] * v1, diagonal[2] * v2)
     mv = m0 * v0 + m1 * v1 + m2 * v2
     E0, E1, E2, E3 = dg * mv, g * m0, g * m1, g * m2
     # dq/da_i = -e_i q / 2 and dq/db_i = q e_i / 2, as 4 x 6 columns.
@@ -182,16 +231,20 @@ def _bending(q, B, rest, D, grad_a, grad_b, H_aa, H_bb, H_ab, with_hessian):
         grad_b[i] = E0 * J[0, i + 3] + E1 * J[1, i + 3] + E2 * J[2, i + 3] + E3 * J[3, i + 3]
     if not with_hessian:
         return energy
-    E_ww = ddg * mv + dg * dg * (B[0] * v0 * v0 + B[1] * v1 * v1 + B[2] * v2 * v2) / D
+    E_ww = ddg * mv + dg * dg * (Bv[0] * v0 + Bv[1] * v1 + Bv[2] * v2) / D
     T = np.empty((4, 6))
     for c in range(6):
         T[0, c] = E_ww * J[0, c]
     for k in range(3):
-        E_wk = dg * (m[k] + B[k] * g * v[k] / D)
-        E_kk = B[k] * g * g / D
+        E_wk = dg * (m[k] + g * Bv[k] / D)
+        E_kk = diagonal[k] * g * g / D
         for c in range(6):
             T[0, c] += E_wk * J[k + 1, c]
             T[k + 1, c] = E_wk * J[0, c] + E_kk * J[k + 1, c]
+    if B01 != 0.0:
+        for c in range(6):
+            T[1, c] += B01 * g * g / D * J[2, c]
+            T[2, c] += B01 * g * g / D * J[1, c]
     spin = -0.25 * (E0 * w + E1 * v0 + E2 * v1 + E3 * v2)
     for i in range(3):
         for j in range(i + 1):
@@ -242,6 +295,26 @@ def strains(rod, x, q, ends, gamma, kappa):
         g, _, _ = log_factor(relative[0])
         for k in range(3):
             kappa[i, k] = g * relative[k + 1] / rod.voronoi_length[i]
+
+
+@njit(cache=True)
+def flow_plastically(rod, kappa, plastic):
+    """Update ``plastic`` (n + 1, 2) to its value at curvatures ``kappa`` (n + 1, 3).
+
+    Returns the energy dissipated [J].
+    """
+    dissipated = 0.0
+    for i in range(kappa.shape[0]):
+        B, old, limit, H = rod.bending[i, 0], rod.plastic[i], rod.yield_moment[i], rod.hardening[i]
+        m0 = B * (kappa[i, 0] - rod.rest_curvature[i, 0] - old[0])
+        m1 = B * (kappa[i, 1] - rod.rest_curvature[i, 1] - old[1])
+        f0, f1, flow = 0.0, 0.0, 0.0
+        if (m0 - H * old[0]) ** 2 + (m1 - H * old[1]) ** 2 > limit * limit:
+            f0, f1, flow, _ = plastic_flow(m0, m1, B, old, limit, H)
+        plastic[i, 0] = old[0] + flow * f0
+        plastic[i, 1] = old[1] + flow * f1
+        dissipated += rod.voronoi_length[i] * limit * flow if flow > 0.0 else 0.0
+    return dissipated
 
 
 @njit(cache=True)
@@ -335,8 +408,7 @@ def assemble_rod(rod, x, q, ends, work, with_hessian):
         after = ends.frames[1] if i == n else q[i]
         relative_quaternion(before, after, relative)
         energy += _bending(
-            relative, rod.bending[i], rod.rest_curvature[i], rod.voronoi_length[i],
-            grad_a, grad_b, H_aa, H_bb, H_ab, with_hessian,
+            relative, rod, i, grad_a, grad_b, H_aa, H_bb, H_ab, with_hessian,
         )  # fmt: skip
         left, right = 6 * (i - 1) + 3, 6 * i + 3
         if i == 0:

@@ -4,15 +4,16 @@ from math import ceil, isfinite
 
 import numpy as np
 
-from dlo_gym.geometry.se3 import matrix_to_quaternion
-from dlo_gym.rod._kernels_dynamics import Motion, Plan
+from dlo_gym.geometry.se3 import Array, matrix_to_quaternion
+from dlo_gym.rod._kernels_dynamics import Plan
+from dlo_gym.rod._kernels_moment import Motion
 from dlo_gym.rod._kernels_rates import ClampPath
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.properties import RodProperties, per_element
 
 
-def motion_of(properties: RodProperties, n: int) -> Motion:
-    """Masses of nodes, half of the elements beside them, and of spins; damping."""
+def motion_of(properties: RodProperties, n: int, rest_curvature: Array) -> Motion:
+    """Masses of nodes, half of the elements beside them, and of spins; damping and creep."""
     mass = per_element(properties.linear_density, n) * properties.length / n
     nodes = np.zeros(n + 1)
     nodes[:-1] += 0.5 * mass
@@ -22,6 +23,10 @@ def motion_of(properties: RodProperties, n: int) -> Motion:
         np.concatenate([nodes, np.repeat(spin, 2)]),
         float(properties.external_damping),
         float(properties.internal_damping),
+        float(properties.creep),
+        float(properties.relaxation_time),
+        properties.yield_curvature is not None,
+        rest_curvature,
     )
 
 

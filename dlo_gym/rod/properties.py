@@ -12,6 +12,7 @@ from dlo_gym.geometry.se3 import Array
 SHEAR_CORRECTION = 27.0 / 28.0
 PER_ELEMENT = (
     "radius", "youngs_modulus", "density", "EI", "GJ", "EA", "kGA", "mass_per_length",
+    "yield_curvature",
 )  # fmt: skip
 
 
@@ -35,6 +36,10 @@ class RodProperties:
         mass_per_length: [kg/m]; replaces the one that follows from density and radius.
         external_damping: rate at which the surroundings slow every part of the rod [1/s].
         internal_damping: viscosity over stiffness, eta of S (strain + eta d(strain)/dt) [s].
+        yield_curvature: elastic curvature beyond which the rod bends for good [1/m]; None if never.
+        hardening: slope of the moment beyond yield over EI, from 0 up to less than 1.
+        creep: share of EI and GJ that relaxes with time (a standard linear solid), 0 to 1.
+        relaxation_time: time constant of that share under constant curvature [s].
 
     Raises:
         ValueError: naming the field, if a value is not finite or not physical.
@@ -53,6 +58,10 @@ class RodProperties:
     mass_per_length: float | Array | None = None
     external_damping: float = 0.0
     internal_damping: float = 0.0
+    yield_curvature: float | Array | None = None
+    hardening: float = 0.0
+    creep: float = 0.0
+    relaxation_time: float = 1.0
 
     def __post_init__(self) -> None:
         if not (isfinite(self.length) and self.length > 0):
@@ -72,6 +81,13 @@ class RodProperties:
             value = getattr(self, name)
             if not (isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name}: expected zero or a positive number, got {value}")
+        for name in ("hardening", "creep"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise ValueError(f"{name}: expected 0 <= {name} < 1, got {getattr(self, name)}")
+        if not (isfinite(self.relaxation_time) and self.relaxation_time > 0.0):
+            raise ValueError(
+                f"relaxation_time: expected a positive time [s], got {self.relaxation_time}"
+            )
         rest = np.asarray(self.rest_curvature, dtype=np.float64)
         if rest.shape[-1:] != (3,) or rest.ndim > 2 or not np.isfinite(rest).all():
             raise ValueError(

@@ -14,16 +14,18 @@ from dlo_gym.rod import _kernels_solve as kernels
 from dlo_gym.rod._kernels_assembly import System
 from dlo_gym.rod._kernels_clamps import clamp_frame
 from dlo_gym.rod._kernels_inertia import NO_INERTIA
+from dlo_gym.rod._kernels_moment import hidden_energy
 from dlo_gym.rod._kernels_rates import kinetic_energy
+from dlo_gym.rod.arrays import node_weights, rod_arrays
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.dynamics import clamp_path, motion_of, plan_of
 from dlo_gym.rod.initial_shapes import hanging
-from dlo_gym.rod.properties import RodProperties, per_element
-from dlo_gym.rod.state import RodState
+from dlo_gym.rod.properties import RodProperties
+from dlo_gym.rod.sensitivity import parameter_sensitivity
+from dlo_gym.rod.state import RodMemory, RodState
 
 GRAVITY = (0.0, 0.0, -9.81)
 TOLERANCE = 1e-9  # residual relative to the rod's own weight and stiffness
-RIGID_JOINT = 1e-3  # of an element: the piece between clamp and element when it holds the element
 LARGEST_STRAIN = 0.25  # beside what a few times the rod's own weight stretches
 LARGEST_BEND = 2.4  # between neighbouring elements [rad]
 LARGEST_MOVE = (0.08, 0.3)  # of one sub-step: translation per rod length, rotation [rad]
@@ -68,9 +70,9 @@ class CosseratRod:
         self.gravity = np.asarray(gravity, dtype=np.float64)
         if self.gravity.shape != (3,) or not np.isfinite(self.gravity).all():
             raise ValueError(f"gravity: expected three finite numbers [m/s^2], got {gravity}")
-        self._arrays = _arrays(properties, n_elements, self.gravity, clamp)
+        self._arrays = rod_arrays(properties, n_elements, self.gravity, clamp)
         self._system = System(self._arrays, NO_INERTIA)
-        self._motion = motion_of(properties, n_elements)
+        self._motion = motion_of(properties, n_elements, self._arrays.rest_curvature.copy())
         stiffness = float(self._arrays.bending[:, 0].mean())
         weight = float(np.abs(self._arrays.forces).sum())
         # Differences of coordinates of about 1 m carry this much of rounding error in force.
@@ -108,7 +110,7 @@ class CosseratRod:
             raise ValueError(
                 f"forces: expected finite values of shape ({self.n_nodes}, 3), got {forces.shape}"
             )
-        weight = _weight(self.properties, self.n_elements, self.gravity)
+        weight = node_weights(self.properties, self.n_elements, self.gravity)
         self._arrays = self._arrays._replace(forces=weight + forces)
         self._system = self._system._replace(rod=self._arrays)
 
@@ -221,7 +223,7 @@ class CosseratRod:
         saved = self.state
         status, reached, self._energy = dynamics_kernels.advance(
             self._system, self._motion, clamp_path(before, displacement, duration), self._ends,
-            self._x, self._q, self._v, self._w, plan, self._limits, self._work,
+            self._x, self._q, self._v, self._w, self._creep, plan, self._limits, self._work,
         )  # fmt: skip
         problem = "" if status == kernels.CONVERGED else "no time step was small enough"
         problem = problem or self._implausible()
@@ -247,11 +249,14 @@ class CosseratRod:
         """
         boundary = self._settled("state")
         strain, curvature = self._strains()
+        plastic = np.zeros((self.n_nodes, 2))
+        if self._motion.yields:
+            energy_kernels.flow_plastically(self._arrays, curvature, plastic)
         wrenches = self._wrenches()
         return RodState(
             positions=self._x.copy(),
             quaternions=self._q.copy(),
-            curvature=curvature,
+            curvature=curvature[1:-1].copy(),
             strain=strain,
             boundary=boundary,
             wrench_left=wrenches[0],
@@ -261,6 +266,8 @@ class CosseratRod:
             velocities=self._v.copy(),
             angular_velocities=self._w.copy(),
             kinetic_energy=kinetic_energy(self._motion, self._v, self._w),
+            plastic_curvature=plastic[1:-1].copy(),
+            memory=RodMemory(self._arrays.plastic.copy(), self._creep.copy()),
             time=self._time,
         )
 
@@ -275,6 +282,8 @@ class CosseratRod:
         self._set(state.positions.copy(), state.quaternions.copy(), state.boundary)
         self._v, self._w = state.velocities.copy(), state.angular_velocities.copy()
         self._time = state.time
+        self._arrays.plastic[:], self._creep[:] = state.memory
+        self._set_rest()
         self._work.stress[:] = state.stress
         self._linearise()
 
@@ -287,8 +296,24 @@ class CosseratRod:
         self._settled("sensitivity")
         columns = np.empty((len(self._work.gradient), 12))
         kernels.sensitivity(self._work, self._rotations, self._ends.right_held, columns)
-        positions = np.arange(self.n_nodes)[:, None] * 6 + np.arange(3)
-        return columns[positions]
+        return self._of_nodes(columns)
+
+    def parameter_sensitivity(self) -> Array:
+        """d(positions)/d(parameters), shape (n_nodes, 3, 7), at an equilibrium.
+
+        Columns follow ``sensitivity.PARAMETERS``: log EI, log GJ, log of the weight, the three
+        components of a uniform rest curvature [1/m], and the length [m]. A rod that yields keeps
+        the plastic curvature it had before its last solve.
+        """
+        self._settled("parameter_sensitivity")
+        weight = node_weights(self.properties, self.n_elements, self.gravity)
+        return self._of_nodes(
+            parameter_sensitivity(self._system, weight, self._x, self._q, self._ends, self._work)
+        )
+
+    def _of_nodes(self, columns: Array) -> Array:
+        """The rows of (n_dofs, m) that are positions, as (n_nodes, 3, m)."""
+        return columns[np.arange(self.n_nodes)[:, None] * 6 + np.arange(3)]
 
     def _settled(self, action: str) -> BoundaryPoses:
         """The clamp poses, of a rod that has some."""
@@ -299,6 +324,34 @@ class CosseratRod:
     def _stop(self) -> None:
         self._v, self._w = np.zeros((self.n_nodes, 3)), np.zeros((self.n_elements, 3))
         self._time = 0.0
+        self._creep = np.zeros((self.n_nodes, 3))
+        self._arrays.plastic[:] = 0.0
+        self._set_rest()
+
+    def _set_rest(self) -> None:
+        """The relaxed share of the stiffness as a shift of the rest curvature."""
+        if self._motion.creep > 0.0:
+            relaxed = self._motion.creep * self._creep
+            self._arrays.rest_curvature[:] = self._motion.rest_curvature + relaxed
+
+    def _flow(self) -> None:
+        """Take what has bent plastically as given before the next solve."""
+        if self._motion.yields:
+            plastic = np.empty((self.n_nodes, 2))
+            energy_kernels.flow_plastically(self._arrays, self._strains()[1], plastic)
+            self._arrays.plastic[:] = plastic
+
+    def _stored(self, potential: float) -> float:
+        """Energy [J] stored, of an incremental potential that counts what was dissipated."""
+        if not self._motion.yields and self._motion.creep == 0.0:
+            return potential
+        plastic = np.empty((self.n_nodes, 2))
+        lost = energy_kernels.flow_plastically(self._arrays, self._strains()[1], plastic)
+        return (
+            potential
+            - lost
+            + hidden_energy(self._motion, self._arrays, self._creep, self._arrays.plastic)
+        )
 
     def _check_reach(self, boundary: BoundaryPoses) -> None:
         if boundary.distance >= self.properties.length:
@@ -320,9 +373,10 @@ class CosseratRod:
         self._ends = energy_kernels.Ends(frames, boundary.right is not None)
 
     def _linearise(self) -> int:
-        self._energy, negative = kernels.linearise(
+        potential, negative = kernels.linearise(
             self._system, self._x, self._q, self._ends, self._work
-        )  # fmt: skip
+        )
+        self._energy = self._stored(potential)
         return negative
 
     def _minimise(self) -> str:
@@ -338,6 +392,7 @@ class CosseratRod:
     def _follow(self, end: BoundaryPoses, twist: Array) -> bool:
         """One sub-step to ``end``; on failure the rod is as before."""
         x, q, stress = self._x.copy(), self._q.copy(), self._work.stress.copy()
+        self._flow()
         before, energy, wrenches = self._boundary, self._energy, self._wrenches()
         assert before is not None
         rotations = self._rotations
@@ -353,7 +408,7 @@ class CosseratRod:
             work = 0.5 * full_twist @ (wrenches + self._wrenches()).ravel()
             slack = abs(work) + 1e-3 * self._limits.torque
             if energy_after - energy <= work + slack and not self._implausible():
-                self._energy = energy_after
+                self._energy = self._stored(energy_after)
                 return True
         self._set(x, q, before)
         self._work.stress[:] = stress
@@ -381,17 +436,16 @@ class CosseratRod:
         largest = float(np.abs(strain).max())
         if not largest < self._largest_strain:
             return f"an element is strained by {largest:.2g}, beyond {self._largest_strain:.2g}"
-        voronoi = self._arrays.voronoi_length[1:-1]
-        bend = float((np.linalg.norm(curvature, axis=1) * voronoi).max())
+        bend = float((np.linalg.norm(curvature, axis=1) * self._arrays.voronoi_length).max())
         if not bend < LARGEST_BEND:
             return f"neighbouring elements bend by {bend:.2g} rad, beyond {LARGEST_BEND:.2g}"
         return ""
 
     def _strains(self) -> tuple[Array, Array]:
-        """Strain (n, 3) of the elements and curvature (n - 1, 3) at the inner nodes."""
+        """Strain (n, 3) of the elements and curvature (n + 1, 3) at nodes, clamps' included."""
         strain, curvature = np.empty((self.n_elements, 3)), np.empty((self.n_nodes, 3))
         energy_kernels.strains(self._arrays, self._x, self._q, self._ends, strain, curvature)
-        return strain, curvature[1:-1].copy()
+        return strain, curvature
 
     def _wrenches(self) -> Array:
         """(2, 6) force and torque of the clamps on the rod, world axes."""
@@ -402,45 +456,6 @@ class CosseratRod:
             wrenches[1, :3] = self._work.gradient[-3:]
             wrenches[1, 3:] = self._rotations[1] @ self._work.clamp_terms[1, 0]
         return wrenches
-
-
-def _arrays(
-    properties: RodProperties, n: int, gravity: Array, clamp: str
-) -> energy_kernels.RodArrays:
-    """The kernels' constants: element values, and their averages at the nodes between."""
-    rest_length = np.full(n, properties.length / n)
-    shear = np.column_stack(
-        [per_element(properties.shearing_stiffness, n)] * 2
-        + [per_element(properties.stretching_stiffness, n)]
-    )
-    bend = per_element(properties.bending_stiffness, n)
-    twist = per_element(properties.twisting_stiffness, n)
-    elements = np.column_stack([bend, bend, twist])
-    # Two half elements in series: the harmonic mean of their stiffnesses.
-    between = 2.0 / (1.0 / elements[:-1] + 1.0 / elements[1:])
-    rest = np.asarray(properties.rest_curvature, dtype=np.float64)
-    rest = np.broadcast_to(rest, (n - 1, 3))
-    joint = (RIGID_JOINT if clamp == "element" else 0.5) * properties.length / n
-    voronoi = np.full(n + 1, properties.length / n)
-    voronoi[[0, -1]] = joint
-    return energy_kernels.RodArrays(
-        rest_length,
-        np.ascontiguousarray(shear),
-        np.zeros((n, 3)),
-        np.concatenate([elements[:1], between, elements[-1:]]),
-        np.concatenate([rest[:1], rest, rest[-1:]]),
-        voronoi,
-        _weight(properties, n, gravity),
-    )
-
-
-def _weight(properties: RodProperties, n: int, gravity: Array) -> Array:
-    """(n + 1, 3) weight of each node [N]: half of the elements beside it."""
-    mass = per_element(properties.linear_density, n) * properties.length / n
-    nodes = np.zeros(n + 1)
-    nodes[:-1] += 0.5 * mass
-    nodes[1:] += 0.5 * mass
-    return nodes[:, None] * gravity
 
 
 def _frames_along(positions: Array, boundary: BoundaryPoses) -> Array:

@@ -1,12 +1,25 @@
 """What is known of a rod: its full mechanical state, or an estimate of its shape."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_gym.geometry.se3 import Array, quaternion_to_matrix
 from dlo_gym.rod.boundary import BoundaryPoses
+
+
+class RodMemory(NamedTuple):
+    """The inelastic rod's past.
+
+    Attributes:
+        plastic: (n_nodes, 2) plastic curvature before the last solve [1/m].
+        creep: (n_nodes, 3) curvature at which the relaxing stiffness rests [1/m].
+    """
+
+    plastic: Array
+    creep: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +41,8 @@ class RodState:
         velocities: (n_nodes, 3) in world axes [m/s]; zero in equilibrium.
         angular_velocities: (n_elements, 3) about d1, d2, d3 of each element [rad/s].
         kinetic_energy: [J].
+        plastic_curvature: (n_elements - 1, 2) curvature about d1 and d2 that stays [1/m].
+        memory: what else the rod must know to go on from here to the last bit.
         time: advanced since the rod last settled [s].
     """
 
@@ -43,6 +58,8 @@ class RodState:
     velocities: Array
     angular_velocities: Array
     kinetic_energy: float
+    plastic_curvature: Array
+    memory: RodMemory
     time: float
 
     @property
