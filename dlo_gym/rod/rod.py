@@ -1,5 +1,6 @@
 """The Cosserat rod: equilibrium between clamps, moves, sensitivities."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -11,6 +12,7 @@ from dlo_gym.geometry.se3 import Array, exp_so3, log_so3, matrix_to_quaternion
 from dlo_gym.rod import _kernels_dynamics as dynamics_kernels
 from dlo_gym.rod import _kernels_energy as energy_kernels
 from dlo_gym.rod import _kernels_solve as kernels
+from dlo_gym.rod import contact_dynamics
 from dlo_gym.rod._kernels_assembly import System
 from dlo_gym.rod._kernels_clamps import clamp_frame
 from dlo_gym.rod._kernels_inertia import NO_INERTIA
@@ -18,8 +20,10 @@ from dlo_gym.rod._kernels_moment import hidden_energy
 from dlo_gym.rod._kernels_rates import kinetic_energy
 from dlo_gym.rod.arrays import node_weights, rod_arrays
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
+from dlo_gym.rod.contact import ContactModel, check_clamps
 from dlo_gym.rod.dynamics import clamp_path, motion_of, plan_of
 from dlo_gym.rod.initial_shapes import hanging
+from dlo_gym.rod.obstacles import Obstacle, check_obstacles, on_the_way
 from dlo_gym.rod.properties import RodProperties
 from dlo_gym.rod.sensitivity import parameter_sensitivity
 from dlo_gym.rod.state import RodMemory, RodState
@@ -46,6 +50,9 @@ class CosseratRod:
         clamp: "element" clamps the frame of the whole first and last element, as PyElastica and
             the tracking paper do; "node" clamps the frame at the end node itself, which converges
             to the continuous rod with second order in n.
+        obstacles: rigid bodies that the rod can touch.
+        self_contact: whether it can touch itself.
+        friction: Coulomb's coefficient between rod and obstacles.
 
     Raises:
         ValueError: naming the argument, or the per-element property that has another number of
@@ -59,6 +66,9 @@ class CosseratRod:
         *,
         gravity: ArrayLike = GRAVITY,
         clamp: Literal["element", "node"] = "element",
+        obstacles: Sequence[Obstacle] = (),
+        self_contact: bool = False,
+        friction: float = 0.0,
     ) -> None:
         if not isinstance(n_elements, int | np.integer) or n_elements < 2:
             raise ValueError(f"n_elements: expected an integer of at least 2, got {n_elements}")
@@ -93,6 +103,7 @@ class CosseratRod:
             clamp_terms=np.zeros((2, 4, 3)),
         )
         self._boundary: BoundaryPoses | None = None
+        self._contact = ContactModel(properties, n_elements, obstacles, self_contact, friction)
         self._stop()
 
     @property
@@ -123,10 +134,11 @@ class CosseratRod:
                 when omitted. Of several equilibria the one downhill from the start is found.
 
         Raises:
-            ValueError: if the clamps are further apart than the rod is long.
+            ValueError: if the clamps are further apart than the rod is long, or one is inside an
+                obstacle.
             RodDiverged: if no equilibrium was found; the rod keeps its former state.
         """
-        self._check_reach(boundary)
+        self._check_boundary(boundary, self._contact.obstacles)
         if start is None:
             start = hanging(boundary, self.properties.length, self.n_nodes)
         start = np.asarray(start, dtype=np.float64)
@@ -142,6 +154,7 @@ class CosseratRod:
         if boundary.right is not None:
             positions[-1] = boundary.right[:3, 3]
         self._set(positions, _frames_along(positions, boundary), boundary)
+        self._contact.let_go()
         problem = self._minimise()
         if problem:
             if former is not None:
@@ -155,17 +168,26 @@ class CosseratRod:
             )
         return self.state
 
-    def move(self, displacement: BoundaryDisplacement) -> RodState:
+    def move(
+        self, displacement: BoundaryDisplacement, obstacles: Sequence[Obstacle] | None = None
+    ) -> RodState:
         """Move the clamps and follow the equilibrium; large moves are taken in sub-steps.
 
+        Args:
+            displacement: of the clamps.
+            obstacles: the rod's own obstacles at the poses to which they go meanwhile; None where
+                they stay.
+
         Raises:
-            ValueError: if the rod has not settled, or the clamps would end further apart than the
-                rod is long.
+            ValueError: if the rod has not settled, the clamps would end further apart than the rod
+                is long or inside an obstacle, or the obstacles are other ones.
             RodDiverged: if the equilibrium was lost; the rod keeps its state before the move.
         """
         before = self._settled("move")
         target = before.displaced(displacement)
-        self._check_reach(target)
+        standing = self._contact.obstacles
+        moved = standing if obstacles is None else self._contact.check_same(obstacles)
+        self._check_boundary(target, moved)
         saved = self.state
         self._v, self._w = np.zeros((self.n_nodes, 3)), np.zeros((self.n_elements, 3))
         vector = displacement.vector
@@ -174,13 +196,14 @@ class CosseratRod:
         while done < 1.0:
             reached = done + stride if done + stride < 1.0 - 1e-9 else 1.0
             end = target if reached == 1.0 else before.displaced(displacement.scaled(reached))
-            if self._follow(end, (reached - done) * vector):
+            bodies = None if obstacles is None else on_the_way(standing, moved, reached)
+            if self._follow(end, (reached - done) * vector, bodies):
                 done = reached
                 continue
             stride *= 0.5
             if stride >= SMALLEST_SUBSTEP * full_stride:
                 continue
-            problem = self._jump(end)
+            problem = self._jump(end, bodies)
             if problem:
                 self.restore(saved)
                 raise RodDiverged(
@@ -192,14 +215,36 @@ class CosseratRod:
             done, stride = reached, full_stride
         return self.state
 
+    def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        """Put other obstacles around the rod, which settles among them from where it is.
+
+        ``move`` is for obstacles that move: it goes with them.
+
+        Raises:
+            ValueError: if an entry is no obstacle, or a clamp is inside one.
+            RodDiverged: if no equilibrium was found; rod and obstacles stay as they were.
+        """
+        obstacles = check_obstacles(obstacles)
+        if self._boundary is None:
+            self._contact.replace(obstacles)
+            return
+        check_clamps(self._boundary, obstacles, self._contact.radii)
+        former = self.state
+        self._contact.replace(obstacles)
+        problem = self._minimise()
+        if problem:
+            self.restore(former)
+            raise RodDiverged(f"no equilibrium among the obstacles: {problem}", last_good=former)
+
     def advance(
         self,
         displacement: BoundaryDisplacement,
         duration: float,
         *,
         dt: float = 0.025,
-        order: Literal[1, 2] = 2,
+        order: Literal[1, 2] | None = None,
         tolerance: float | None = None,
+        obstacles: Sequence[Obstacle] | None = None,
     ) -> RodState:
         """Let time pass while the clamps move along ``displacement`` with constant velocity.
 
@@ -207,24 +252,41 @@ class CosseratRod:
             displacement: of the clamps; zero to hold them still.
             duration: [s].
             dt: largest time step [s]; 10 to 100 ms are stable for any rod.
-            order: 2 for TR-BDF2, 1 for the implicit Euler method, which damps much more.
+            order: 2 for TR-BDF2, 1 for the implicit Euler method, which damps much more. None
+                takes 1 for a rod that can touch something, which has no other, else 2.
             tolerance: on the estimated error of a node's position in one step [m]; steps are
-                chosen to keep it. None takes equal steps.
+                chosen to keep it. None takes equal steps; a rod that can touch something must.
+            obstacles: the rod's own obstacles at the poses to which they go meanwhile; None where
+                they stay.
 
         Raises:
             ValueError: naming the argument; or if the rod has not settled, or the clamps would end
-                further apart than the rod is long.
+                further apart than the rod is long or inside an obstacle.
             RodDiverged: if no step was small enough; the rod keeps its state before.
         """
         before = self._settled("advance")
-        plan = plan_of(duration, dt, order, tolerance)
+        touching = self._contact.possible
+        if touching and (order == 2 or tolerance is not None):
+            raise ValueError(
+                "order, tolerance: expected order 1 and no tolerance for a rod that can touch"
+                f" something, got {order} and {tolerance}"
+            )
+        plan = plan_of(duration, dt, order or (1 if touching else 2), tolerance)
         target = before.displaced(displacement)
-        self._check_reach(target)
+        moved = None if obstacles is None else self._contact.check_same(obstacles)
+        self._check_boundary(target, self._contact.obstacles if moved is None else moved)
         saved = self.state
-        status, reached, self._energy = dynamics_kernels.advance(
-            self._system, self._motion, clamp_path(before, displacement, duration), self._ends,
-            self._x, self._q, self._v, self._w, self._creep, plan, self._limits, self._work,
-        )  # fmt: skip
+        path = clamp_path(before, displacement, duration)
+        if touching:
+            status, reached = contact_dynamics.advance(
+                self._contact, moved, self._system, self._motion, path, self._ends,
+                (self._x, self._q, self._v, self._w, self._creep), plan, self._limits, self._work,
+            )  # fmt: skip
+        else:
+            status, reached, self._energy = dynamics_kernels.advance(
+                self._system, self._motion, path, self._ends,
+                self._x, self._q, self._v, self._w, self._creep, plan, self._limits, self._work,
+            )  # fmt: skip
         problem = "" if status == kernels.CONVERGED else "no time step was small enough"
         problem = problem or self._implausible()
         if problem:
@@ -269,6 +331,7 @@ class CosseratRod:
             plastic_curvature=plastic[1:-1].copy(),
             memory=RodMemory(self._arrays.plastic.copy(), self._creep.copy()),
             time=self._time,
+            contact=self._contact.state(self._x) if self._contact.possible else None,
         )
 
     def restore(self, state: RodState) -> None:
@@ -285,6 +348,7 @@ class CosseratRod:
         self._arrays.plastic[:], self._creep[:] = state.memory
         self._set_rest()
         self._work.stress[:] = state.stress
+        self._contact.restore(state.contact)
         self._linearise()
 
     def sensitivity(self) -> Array:
@@ -295,7 +359,10 @@ class CosseratRod:
         """
         self._settled("sensitivity")
         columns = np.empty((len(self._work.gradient), 12))
-        kernels.sensitivity(self._work, self._rotations, self._ends.right_held, columns)
+        if self._contact.possible:
+            self._contact.sensitivity(self._work, self._rotations, self._ends.right_held, columns)
+        else:
+            kernels.sensitivity(self._work, self._rotations, self._ends.right_held, columns)
         return self._of_nodes(columns)
 
     def parameter_sensitivity(self) -> Array:
@@ -304,8 +371,13 @@ class CosseratRod:
         Columns follow ``sensitivity.PARAMETERS``: log EI, log GJ, log of the weight, the three
         components of a uniform rest curvature [1/m], and the length [m]. A rod that yields keeps
         the plastic curvature it had before its last solve.
+
+        Raises:
+            ValueError: if the rod has not settled, or can touch something.
         """
         self._settled("parameter_sensitivity")
+        if self._contact.possible:
+            raise ValueError("parameter_sensitivity: expected a rod that can touch nothing")
         weight = node_weights(self.properties, self.n_elements, self.gravity)
         return self._of_nodes(
             parameter_sensitivity(self._system, weight, self._x, self._q, self._ends, self._work)
@@ -353,7 +425,8 @@ class CosseratRod:
             + hidden_energy(self._motion, self._arrays, self._creep, self._arrays.plastic)
         )
 
-    def _check_reach(self, boundary: BoundaryPoses) -> None:
+    def _check_boundary(self, boundary: BoundaryPoses, obstacles: Sequence[Obstacle]) -> None:
+        check_clamps(boundary, obstacles, self._contact.radii)
         if boundary.distance >= self.properties.length:
             raise ValueError(
                 f"overstretched: the clamps would be {boundary.distance:.4f} m apart, the rod is"
@@ -372,45 +445,60 @@ class CosseratRod:
         clamp_frame(right, self._rotations[1], frames[1])
         self._ends = energy_kernels.Ends(frames, boundary.right is not None)
 
+    @property
+    def _shape(self):
+        return self._system, self._x, self._q, self._ends
+
     def _linearise(self) -> int:
-        potential, negative = kernels.linearise(
-            self._system, self._x, self._q, self._ends, self._work
-        )
+        if self._contact.possible:
+            potential, negative = self._contact.linearise(self._shape, self._work)
+        else:
+            potential, negative = kernels.linearise(*self._shape, self._work)
         self._energy = self._stored(potential)
         return negative
 
     def _minimise(self) -> str:
         """Settle from the present shape; returns what is wrong with the result, or ""."""
-        status, steps = kernels.minimise(
-            self._system, self._x, self._q, self._ends, self._limits, 2000, self._work
-        )  # fmt: skip
+        if self._contact.possible:
+            status, steps = self._contact.minimise(self._shape, self._limits, 2000, self._work)
+        else:
+            status, steps = kernels.minimise(*self._shape, self._limits, 2000, self._work)
         self._linearise()
         if status != kernels.CONVERGED:
             return f"no convergence in {steps} Newton steps"
         return self._implausible()
 
-    def _follow(self, end: BoundaryPoses, twist: Array) -> bool:
+    def _follow(
+        self, end: BoundaryPoses, twist: Array, obstacles: Sequence[Obstacle] | None
+    ) -> bool:
         """One sub-step to ``end``; on failure the rod is as before."""
         x, q, stress = self._x.copy(), self._q.copy(), self._work.stress.copy()
         self._flow()
+        contact = self._contact.save()
         before, energy, wrenches = self._boundary, self._energy, self._wrenches()
         assert before is not None
         rotations = self._rotations
         self._set_clamps(end)
         full_twist = np.zeros(12)
         full_twist[: len(twist)] = twist
-        status, energy_after = kernels.follow(
-            self._system, self._x, self._q, self._ends, full_twist, rotations, self._limits,
-            self._work,
-        )  # fmt: skip
+        if self._contact.possible:
+            status, energy_after = self._contact.follow(
+                self._shape, full_twist, rotations, obstacles, self._limits, self._work
+            )
+        else:
+            status, energy_after = kernels.follow(
+                *self._shape, full_twist, rotations, self._limits, self._work
+            )
         if status == kernels.CONVERGED:
             # The clamps' work bounds the energy's rise; more means another branch was reached.
             work = 0.5 * full_twist @ (wrenches + self._wrenches()).ravel()
             slack = abs(work) + 1e-3 * self._limits.torque
-            if energy_after - energy <= work + slack and not self._implausible():
+            bounded = obstacles is not None or energy_after - energy <= work + slack
+            if bounded and not self._implausible():
                 self._energy = self._stored(energy_after)
                 return True
         self._set(x, q, before)
+        self._contact.load(contact)
         self._work.stress[:] = stress
         self._linearise()
         return False
@@ -423,12 +511,15 @@ class CosseratRod:
             translation / (LARGEST_MOVE[0] * self.properties.length), rotation / LARGEST_MOVE[1]
         )
 
-    def _jump(self, end: BoundaryPoses) -> str:
+    def _jump(self, end: BoundaryPoses, obstacles: Sequence[Obstacle] | None) -> str:
         """Past a loss of stability: descend to the equilibrium that the rod snaps to."""
         self._set_clamps(end)
+        before = self._x.copy()
         self._x[0] = end.left[:3, 3]
         if end.right is not None:
             self._x[-1] = end.right[:3, 3]
+        if self._contact.possible and not self._contact.place(before, self._x, obstacles):
+            return "an obstacle is in the way"
         return self._minimise()
 
     def _implausible(self) -> str:
@@ -439,7 +530,7 @@ class CosseratRod:
         bend = float((np.linalg.norm(curvature, axis=1) * self._arrays.voronoi_length).max())
         if not bend < LARGEST_BEND:
             return f"neighbouring elements bend by {bend:.2g} rad, beyond {LARGEST_BEND:.2g}"
-        return ""
+        return self._contact.problem(self._x) if self._contact.possible else ""
 
     def _strains(self) -> tuple[Array, Array]:
         """Strain (n, 3) of the elements and curvature (n + 1, 3) at nodes, clamps' included."""

@@ -8,6 +8,34 @@ from numpy.typing import NDArray
 
 from dlo_gym.geometry.se3 import Array, quaternion_to_matrix
 from dlo_gym.rod.boundary import BoundaryPoses
+from dlo_gym.rod.obstacles import Obstacle
+
+
+@dataclass(frozen=True, eq=False)
+class RodContact:
+    """How a rod touches m obstacles at its p contact points, which lie along all its elements.
+
+    Attributes:
+        obstacles: (m,) the bodies, as they stand.
+        points: (p, 3) the contact points, on the centerline, in world [m].
+        gaps: (m, p) from the rod's surface to each obstacle's [m]; negative where they overlap.
+        forces: (m, p, 3) of each obstacle on the rod at each point, friction included [N].
+        self_forces: (n_nodes, 3) of the rod on itself, as forces on its nodes [N].
+        anchors: (m, p, 3) where friction holds each point, in its obstacle's frame [m]; NaN where
+            it holds none; (0, p, 3) without friction.
+    """
+
+    obstacles: tuple[Obstacle, ...]
+    points: Array
+    gaps: Array
+    forces: Array
+    self_forces: Array
+    anchors: Array
+
+    @property
+    def on_obstacles(self) -> Array:
+        """(m, 3) total force of the rod on each obstacle [N]."""
+        return -self.forces.sum(axis=1)
 
 
 class RodMemory(NamedTuple):
@@ -36,7 +64,7 @@ class RodState:
         wrench_left, wrench_right: (6,) force [N] and torque [N m], world axes, that the clamp
             exerts on the rod at its end node; zero at a free end. In motion without the part of
             internal damping.
-        energy: elastic plus gravitational [J].
+        energy: elastic plus gravitational, and that of contact [J].
         stress: (n_elements, 3) internal force along d1, d2 (shear) and d3 (tension) [N].
         velocities: (n_nodes, 3) in world axes [m/s]; zero in equilibrium.
         angular_velocities: (n_elements, 3) about d1, d2, d3 of each element [rad/s].
@@ -44,6 +72,7 @@ class RodState:
         plastic_curvature: (n_elements - 1, 2) curvature about d1 and d2 that stays [1/m].
         memory: what else the rod must know to go on from here to the last bit.
         time: advanced since the rod last settled [s].
+        contact: what the rod touches; None for a rod that can touch nothing.
     """
 
     positions: Array
@@ -61,6 +90,7 @@ class RodState:
     plastic_curvature: Array
     memory: RodMemory
     time: float
+    contact: RodContact | None = None
 
     @property
     def n_nodes(self) -> int:
