@@ -319,7 +319,7 @@ def helix_case() -> Case:
         axes = figure.add_subplot(1, 2, 1, xlabel="arc length / L", ylabel="φ")
         s = (np.arange(counts[-1]) + 0.5) / counts[-1]
         axes.plot(s, exact.envelope, lw=1.0, color="0.3", label="closed form")
-        axes.plot(s[::10], ours.envelope[::10], ".", label="rod")
+        axes.plot(s[::3], ours.envelope[::3], ".", label="rod")
         axes.legend(fontsize=8)
         view = figure.add_subplot(1, 2, 2, projection="3d")
         view.plot(*ours.positions[3 * counts[-1] // 10 : 7 * counts[-1] // 10].T)
