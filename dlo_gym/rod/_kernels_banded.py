@@ -24,14 +24,46 @@ def factorise(band, first, last):
             negative += 1
             if pivot == 0.0:
                 pivot = band[j, 0] = 1e-300
-        reach = min(HALF_BANDWIDTH, last - 1 - j)
-        for k in range(1, reach + 1):
-            factor = band[j, k] / pivot
-            for m in range(k, reach + 1):
-                band[j + k, m - k] -= factor * band[j, m]
-        for k in range(1, reach + 1):
-            band[j, k] /= pivot
+        inverse = 1.0 / pivot
+        if j + HALF_BANDWIDTH < last:  # of fixed size, so that the compiler unrolls it
+            for k in range(1, HALF_BANDWIDTH + 1):
+                factor = band[j, k] * inverse
+                for m in range(k, HALF_BANDWIDTH + 1):
+                    band[j + k, m - k] -= factor * band[j, m]
+            for k in range(1, HALF_BANDWIDTH + 1):
+                band[j, k] *= inverse
+        else:
+            reach = last - 1 - j
+            for k in range(1, reach + 1):
+                factor = band[j, k] * inverse
+                for m in range(k, reach + 1):
+                    band[j + k, m - k] -= factor * band[j, m]
+            for k in range(1, reach + 1):
+                band[j, k] *= inverse
     return negative
+
+
+@njit(cache=True)
+def solve_one(band, first, last, column):
+    """Update ``column`` (n_dofs,) to H^-1 column, given the factors of H."""
+    for j in range(first, last):
+        value = column[j]
+        if j + HALF_BANDWIDTH < last:
+            for k in range(1, HALF_BANDWIDTH + 1):
+                column[j + k] -= band[j, k] * value
+        else:
+            for k in range(1, last - j):
+                column[j + k] -= band[j, k] * value
+    for j in range(last - 1, first - 1, -1):
+        near, far = column[j] / band[j, 0], 0.0
+        if j + HALF_BANDWIDTH < last:
+            for k in range(1, 5):
+                near -= band[j, k] * column[j + k]
+                far += band[j, k + 4] * column[j + k + 4]
+        else:
+            for k in range(1, last - j):
+                near -= band[j, k] * column[j + k]
+        column[j] = near - far
 
 
 @njit(cache=True)

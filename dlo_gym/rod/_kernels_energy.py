@@ -25,6 +25,7 @@ class RodArrays(NamedTuple):
     Attributes:
         rest_length: (n,) l [m].
         shear: (n, 3) S: kGA, kGA, EA [N].
+        rest_strain: (n, 3) gamma0 [-].
         bending: (n + 1, 3) B: EI, EI, GJ [N m^2] at every node; at the ends that of the element.
         rest_curvature: (n + 1, 3) kappa0 [1/m].
         voronoi_length: (n + 1,) D [m]; at the ends the length of rod between clamp and element.
@@ -33,10 +34,41 @@ class RodArrays(NamedTuple):
 
     rest_length: np.ndarray
     shear: np.ndarray
+    rest_strain: np.ndarray
     bending: np.ndarray
     rest_curvature: np.ndarray
     voronoi_length: np.ndarray
     forces: np.ndarray
+
+
+class Ends(NamedTuple):
+    """What holds the rod.
+
+    Attributes:
+        frames: (2, 4) quaternions of the left and right clamp frame.
+        right_held: whether the right clamp exists.
+    """
+
+    frames: np.ndarray
+    right_held: bool
+
+
+class Work(NamedTuple):
+    """What an assembly reads and writes, allocated once; H's rows are x_0 theta_0 x_1 ... x_n.
+
+    Attributes:
+        stress: (n, 3) S (gamma - gamma0) [N] used in the Hessian's geometric part, which may be a
+            prediction of the stress after the next step (Magisano et al. 2017, MIP Newton).
+        gradient: (6 n + 3,) of the potential [N, N m].
+        band: (6 n + 3, 9) lower band of its Hessian, see ``_kernels_banded``.
+        clamp_terms: (2, 4, 3) per clamp the torque [N m] on the rod in the clamp's frame, then
+            d(gradient of the end element's rotation)/d(clamp's rotation) (3, 3).
+    """
+
+    stress: np.ndarray
+    gradient: np.ndarray
+    band: np.ndarray
+    clamp_terms: np.ndarray
 
 
 @njit(cache=True)
@@ -90,7 +122,7 @@ def rotate(q, vx, vy, vz):
 
 
 @njit(cache=True)
-def _log_factor(w):
+def log_factor(w):
     """g, g' and g'' for the rotation vector g(w) v of a unit quaternion (w, v), w >= 0."""
     z = 0.5 * (1.0 - w)
     if z < 0.02:
@@ -125,7 +157,7 @@ def _bending(q, B, rest, D, grad_a, grad_b, H_aa, H_bb, H_ab, with_hessian):
     ``q`` (4,) is the relative quaternion; a and b act as exp(-a/2) q exp(b/2).
     """
     w, v0, v1, v2 = q[0], q[1], q[2], q[3]
-    g, dg, ddg = _log_factor(w)
+    g, dg, ddg = log_factor(w)
     v = (v0, v1, v2)
     m0 = B[0] * (g * v0 / D - rest[0])
     m1 = B[1] * (g * v1 / D - rest[1])
@@ -190,8 +222,8 @@ def _bending(q, B, rest, D, grad_a, grad_b, H_aa, H_bb, H_ab, with_hessian):
 
 
 @njit(cache=True)
-def strains(rod, x, q, gamma, kappa):
-    """Update ``gamma`` (n, 3) and ``kappa`` (n - 1, 3) given nodes x and frames q."""
+def strains(rod, x, q, ends, gamma, kappa):
+    """Update ``gamma`` (n, 3) and ``kappa`` (n + 1, 3) given nodes x and frames q."""
     n = q.shape[0]
     R = np.empty((3, 3))
     relative = np.empty(4)
@@ -203,29 +235,22 @@ def strains(rod, x, q, gamma, kappa):
                 p += R[k, i] * (x[e + 1, k] - x[e, k])
             gamma[e, i] = p / rod.rest_length[e]
         gamma[e, 2] -= 1.0
-        if e > 0:
-            relative_quaternion(q[e - 1], q[e], relative)
-            g, _, _ = _log_factor(relative[0])
-            for i in range(3):
-                kappa[e - 1, i] = g * relative[i + 1] / rod.voronoi_length[e]
+    kappa[n] = 0.0
+    for i in range(n + 1 if ends.right_held else n):
+        before = ends.frames[0] if i == 0 else q[i - 1]
+        relative_quaternion(before, ends.frames[1] if i == n else q[i], relative)
+        g, _, _ = log_factor(relative[0])
+        for k in range(3):
+            kappa[i, k] = g * relative[k + 1] / rod.voronoi_length[i]
 
 
 @njit(cache=True)
-def assemble(rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms, with_hessian):
-    """Energy [J]; update gradient, Hessian band and the clamps' torques and couplings.
+def assemble_rod(rod, x, q, ends, work, with_hessian):
+    """Elastic energy and that of dead loads [J]; overwrites ``work`` but for its stress.
 
-    Args:
-        rod: RodArrays.
-        x, q: (n + 1, 3) nodes [m], (n, 4) element quaternions.
-        clamps: (2, 4) quaternions of the left and right clamp frame.
-        right_held: whether the right clamp exists.
-        stress: (n, 3) S gamma [N] used in the Hessian's geometric part, which may be a
-            prediction of the stress after the next step (Magisano et al. 2017, MIP Newton).
-        gradient: (6 n + 3,) out.
-        band: (6 n + 3, 9) out, if ``with_hessian``.
-        clamp_terms: (2, 4, 3) out: per clamp the torque [N m] on the rod in the clamp's frame,
-            then d(gradient of the end element's rotation)/d(clamp's rotation) (3, 3).
+    The band is written ``with_hessian`` only.
     """
+    stress, gradient, band, clamp_terms = work
     n = q.shape[0]
     energy = 0.0
     gradient[:] = 0.0
@@ -250,8 +275,10 @@ def assemble(rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms,
             for k in range(3):
                 p[i] += R[k, i] * (x[e + 1, k] - x[e, k])
             p[i] /= length
-        n0, n1, n2 = S[0] * p[0], S[1] * p[1], S[2] * (p[2] - 1.0)
-        energy += 0.5 * length * (n0 * p[0] + n1 * p[1] + n2 * (p[2] - 1.0))
+        rest = rod.rest_strain[e]
+        g0, g1, g2 = p[0] - rest[0], p[1] - rest[1], p[2] - 1.0 - rest[2]
+        n0, n1, n2 = S[0] * g0, S[1] * g1, S[2] * g2
+        energy += 0.5 * length * (n0 * g0 + n1 * g1 + n2 * g2)
         for k in range(3):
             force = R[k, 0] * n0 + R[k, 1] * n1 + R[k, 2] * n2
             gradient[base + k] -= force
@@ -302,10 +329,10 @@ def assemble(rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms,
     H_bb = np.empty((3, 3))
     H_ab = np.empty((3, 3))
     for i in range(n + 1):
-        if i == n and not right_held:
+        if i == n and not ends.right_held:
             continue
-        before = clamps[0] if i == 0 else q[i - 1]
-        after = clamps[1] if i == n else q[i]
+        before = ends.frames[0] if i == 0 else q[i - 1]
+        after = ends.frames[1] if i == n else q[i]
         relative_quaternion(before, after, relative)
         energy += _bending(
             relative, rod.bending[i], rod.rest_curvature[i], rod.voronoi_length[i],

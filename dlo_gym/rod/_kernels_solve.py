@@ -1,17 +1,39 @@
 """Newton's method on the rod's energy: following a moving clamp, and settling from afar."""
 
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from dlo_gym.rod._kernels_banded import factorise, multiply_coupling, shift_diagonal, solve
-from dlo_gym.rod._kernels_energy import assemble, rotate
+from dlo_gym.rod._kernels_assembly import assemble
+from dlo_gym.rod._kernels_banded import (
+    factorise,
+    multiply_coupling,
+    shift_diagonal,
+    solve,
+    solve_one,
+)
+from dlo_gym.rod._kernels_energy import rotate
 
 CONVERGED, STALLED, UNSTABLE = 0, 1, 2
 
 LARGEST_TURN = 0.7  # of an element in one Newton step [rad]; beyond, the quadratic model is void
 NEWTON_STEPS = 16
+
+
+class Limits(NamedTuple):
+    """When a solve is over: every free residual is below ``residual`` times its scale.
+
+    Attributes:
+        residual: [-].
+        force: scale of forces on nodes [N].
+        torque: scale of torques on elements [N m].
+    """
+
+    residual: float
+    force: float
+    torque: float
 
 
 @njit(cache=True)
@@ -40,9 +62,9 @@ def exact_stress(rod, x, q, stress):
         t1 = (x[e + 1, 1] - x[e, 1]) / rod.rest_length[e]
         t2 = (x[e + 1, 2] - x[e, 2]) / rod.rest_length[e]
         p0, p1, p2 = _rotate_back(w, a, b, c, t0, t1, t2)
-        stress[e, 0] = rod.shear[e, 0] * p0
-        stress[e, 1] = rod.shear[e, 1] * p1
-        stress[e, 2] = rod.shear[e, 2] * (p2 - 1.0)
+        stress[e, 0] = rod.shear[e, 0] * (p0 - rod.rest_strain[e, 0])
+        stress[e, 1] = rod.shear[e, 1] * (p1 - rod.rest_strain[e, 1])
+        stress[e, 2] = rod.shear[e, 2] * (p2 - 1.0 - rod.rest_strain[e, 2])
 
 
 @njit(cache=True)
@@ -84,11 +106,11 @@ def _largest_turn(step, n):
 
 
 @njit(cache=True)
-def _residual(gradient, first, last, force_scale, torque_scale):
-    """The largest free component of the gradient, relative to the scales [N], [N m]."""
+def _residual(gradient, first, last, limits):
+    """The largest free component of the gradient, relative to the limits' scales."""
     largest = 0.0
     for j in range(first, last):
-        scale = force_scale if (j // 3) % 2 == 0 else torque_scale
+        scale = limits.force if (j // 3) % 2 == 0 else limits.torque
         size = abs(gradient[j]) / scale
         if not size <= largest:  # a NaN counts as large
             largest = size
@@ -96,20 +118,23 @@ def _residual(gradient, first, last, force_scale, torque_scale):
 
 
 @njit(cache=True)
-def linearise(rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms):
-    """Factorise the Hessian at an equilibrium; returns (energy, number of negative pivots)."""
-    exact_stress(rod, x, q, stress)
-    energy = assemble(rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms, True)
-    first, last = free_range(q.shape[0], right_held)
-    return energy, factorise(band, first, last)
+def linearise(system, x, q, ends, work):
+    """Factorise the Hessian, with ``work``'s stress, at a solution.
+
+    Returns (potential, number of negative pivots).
+    """
+    energy = assemble(system, x, q, ends, work, True)
+    first, last = free_range(q.shape[0], ends.right_held)
+    return energy, factorise(work.band, first, last)
 
 
 @njit(cache=True)
-def sensitivity(band, clamp_terms, clamp_rotations, right_held, columns):
+def sensitivity(work, clamp_rotations, right_held, columns):
     """Update ``columns`` (n_dofs, 12) with d(unknowns)/d(clamp twists) at a factorised state.
 
     Twists are in world axes, translation then rotation about the clamp, left then right.
     """
+    band, clamp_terms = work.band, work.clamp_terms
     n_dofs = columns.shape[0]
     n = (n_dofs - 3) // 6
     first, last = free_range(n, right_held)
@@ -136,16 +161,15 @@ def sensitivity(band, clamp_terms, clamp_rotations, right_held, columns):
 
 
 @njit(cache=True)
-def follow(
-    rod, x, q, clamps, right_held, twist, clamp_rotations, tolerance, force_scale, torque_scale,
-    stress, gradient, band, clamp_terms,
-):  # fmt: skip
+def follow(system, x, q, ends, twist, clamp_rotations, limits, work):
     """Move the clamps by ``twist`` (12,) and update the shape to the new equilibrium.
 
     On entry ``band`` holds the factors at the present equilibrium. The first step is their
     linear answer to the moving clamps; then Newton's method with predicted stresses.
-    ``clamps`` must already hold the new quaternions. Returns a status and the energy [J].
+    ``ends`` must already hold the new frames. Returns a status and the potential [J].
     """
+    gradient, band, clamp_terms = work.gradient, work.band, work.clamp_terms
+    right_held = ends.right_held
     n = q.shape[0]
     n_dofs = 6 * n + 3
     first, last = free_range(n, right_held)
@@ -167,7 +191,7 @@ def follow(
             for i in range(3):
                 step[theta + i, 0] -= clamp_terms[side, 1 + i, k] * turn
     for count in range(NEWTON_STEPS):
-        solve(band, first, last, step)
+        solve_one(band, first, last, step[:, 0])
         if count == 0:
             for j in range(n_dofs):
                 if j < first or j >= last:
@@ -175,14 +199,11 @@ def follow(
         turn = _largest_turn(step[:, 0], n)
         if not turn < LARGEST_TURN:
             return STALLED, 0.0
-        apply_step(rod, x, q, step[:, 0], 1.0, stress)
-        assemble(rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms, True)
-        if _residual(gradient, first, last, force_scale, torque_scale) < tolerance:
-            energy, negative = linearise(
-                rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms
-            )
+        apply_step(system.rod, x, q, step[:, 0], 1.0, work.stress)
+        energy = assemble(system, x, q, ends, work, True)
+        negative = factorise(band, first, last)
+        if _residual(gradient, first, last, limits) < limits.residual:
             return (UNSTABLE if negative else CONVERGED), energy
-        factorise(band, first, last)
         step[:, 0] = 0.0
         for j in range(first, last):
             step[j, 0] = -gradient[j]
@@ -190,28 +211,27 @@ def follow(
 
 
 @njit(cache=True)
-def minimise(
-    rod, x, q, clamps, right_held, tolerance, force_scale, torque_scale, max_steps,
-    stress, gradient, band, clamp_terms,
-):  # fmt: skip
-    """Descend the energy from any shape to a stable equilibrium (Levenberg's damped Newton).
+def minimise(system, x, q, ends, limits, max_steps, work):
+    """Descend the potential from any shape to a stable equilibrium (Levenberg's damped Newton).
 
     Every step lowers the energy; the Hessian is shifted until it is positive definite. Leaves
     ``band`` factorised at the solution. Returns a status and the steps taken.
     """
+    rod, stress, gradient, band = system.rod, work.stress, work.gradient, work.band
+    tolerance = limits.residual
     n = q.shape[0]
     n_dofs = 6 * n + 3
-    first, last = free_range(n, right_held)
-    rotation = torque_scale * n
+    first, last = free_range(n, ends.right_held)
+    rotation = limits.torque * n
     translation = rotation / rod.rest_length[0] ** 2
     damping = 1e-3
     step = np.zeros((n_dofs, 1))
     x_trial, q_trial = x.copy(), q.copy()
     exact_stress(rod, x, q, stress)
-    energy = assemble(rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms, True)
+    energy = assemble(system, x, q, ends, work, True)
     undamped = band.copy()
     for count in range(max_steps):
-        residual = _residual(gradient, first, last, force_scale, torque_scale)
+        residual = _residual(gradient, first, last, limits)
         if residual < tolerance:
             band[:] = undamped
             if factorise(band, first, last) == 0:
@@ -227,37 +247,26 @@ def minimise(
             for j in range(first, last):
                 step[j, 0] = -gradient[j]
                 if residual < tolerance:  # a saddle: leave it in a fixed, generic direction
-                    step[j, 0] = 1e-3 * torque_scale * np.cos(1.0 + 0.7 * j)
-            solve(band, first, last, step)
+                    step[j, 0] = 1e-3 * limits.torque * np.cos(1.0 + 0.7 * j)
+            solve_one(band, first, last, step[:, 0])
             turn = _largest_turn(step[:, 0], n)
             scale = min(1.0, 0.5 * LARGEST_TURN / max(turn, 1e-300))
             x_trial[:] = x
             q_trial[:] = q
             apply_step(rod, x_trial, q_trial, step[:, 0], scale, stress)
-            trial = assemble(
-                rod,
-                x_trial,
-                q_trial,
-                clamps,
-                right_held,
-                stress,
-                gradient,
-                band,
-                clamp_terms,
-                False,
-            )
+            trial = assemble(system, x_trial, q_trial, ends, work, False)
             floor = 1e-13 * abs(energy)
             if trial < energy + floor or residual < tolerance:
                 accepted = True
                 damping = damping / 5.0 if scale == 1.0 else damping
                 break
             damping = max(4.0 * damping, 1e-9)
-            assemble(rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms, False)
+            assemble(system, x, q, ends, work, False)
         if not accepted:
             return STALLED, count
         x[:] = x_trial
         q[:] = q_trial
         exact_stress(rod, x, q, stress)
-        energy = assemble(rod, x, q, clamps, right_held, stress, gradient, band, clamp_terms, True)
+        energy = assemble(system, x, q, ends, work, True)
         undamped[:] = band
     return STALLED, max_steps

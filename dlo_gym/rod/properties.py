@@ -10,13 +10,16 @@ from dlo_gym.geometry.se3 import Array
 
 # Shear correction factor of a solid circular section (Cowper 1966, nu = 0.5; PyElastica's value).
 SHEAR_CORRECTION = 27.0 / 28.0
+PER_ELEMENT = (
+    "radius", "youngs_modulus", "density", "EI", "GJ", "EA", "kGA", "mass_per_length",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class RodProperties:
-    """A rod of solid circular cross-section.
+    """A rod of solid circular cross-section, or one whose stiffnesses are known by themselves.
 
-    Scalars describe a uniform rod. Radius, Young's modulus and density also take one value per
+    Scalars describe a uniform rod; fields of type ``float | Array`` also take one value per
     element, shape (n_elements,).
 
     Attributes:
@@ -27,6 +30,11 @@ class RodProperties:
         poisson_ratio: nu; the shear modulus is G = E / (2 (1 + nu)).
         rest_curvature: (3,) or (n_elements - 1, 3) curvature and twist of the unloaded rod in
             its material frame [1/m]: about d1, about d2, and twist about d3.
+        EI, GJ, EA, kGA: stiffness to bending, twist [N m^2], stretch and shear [N]; each replaces
+            the one that follows from E, nu and the radius.
+        mass_per_length: [kg/m]; replaces the one that follows from density and radius.
+        external_damping: rate at which the surroundings slow every part of the rod [1/s].
+        internal_damping: viscosity over stiffness, eta of S (strain + eta d(strain)/dt) [s].
 
     Raises:
         ValueError: naming the field, if a value is not finite or not physical.
@@ -38,11 +46,20 @@ class RodProperties:
     density: float | Array = 1e3
     poisson_ratio: float = 0.5
     rest_curvature: Array | tuple[float, float, float] = (0.0, 0.0, 0.0)
+    EI: float | Array | None = None
+    GJ: float | Array | None = None
+    EA: float | Array | None = None
+    kGA: float | Array | None = None
+    mass_per_length: float | Array | None = None
+    external_damping: float = 0.0
+    internal_damping: float = 0.0
 
     def __post_init__(self) -> None:
         if not (isfinite(self.length) and self.length > 0):
             raise ValueError(f"length: expected a positive length [m], got {self.length}")
-        for name in ("radius", "youngs_modulus", "density"):
+        for name in PER_ELEMENT:
+            if getattr(self, name) is None:
+                continue
             values = np.asarray(getattr(self, name), dtype=np.float64)
             if values.ndim > 1 or not np.isfinite(values).all() or not (values > 0).all():
                 raise ValueError(
@@ -51,6 +68,10 @@ class RodProperties:
             object.__setattr__(self, name, values if values.ndim else float(values))
         if not -1.0 < self.poisson_ratio <= 0.5:
             raise ValueError(f"poisson_ratio: expected -1 < nu <= 0.5, got {self.poisson_ratio}")
+        for name in ("external_damping", "internal_damping"):
+            value = getattr(self, name)
+            if not (isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name}: expected zero or a positive number, got {value}")
         rest = np.asarray(self.rest_curvature, dtype=np.float64)
         if rest.shape[-1:] != (3,) or rest.ndim > 2 or not np.isfinite(rest).all():
             raise ValueError(
@@ -62,9 +83,10 @@ class RodProperties:
         """Check that a rod of ``n_elements`` can have these properties.
 
         Raises:
-            ValueError: naming the property that has another number of values.
+            ValueError: naming the property that has another number of values, or the radius if
+                elements are shorter than it: such a rod has no cross-section to speak of.
         """
-        for name in ("radius", "youngs_modulus", "density"):
+        for name in PER_ELEMENT:
             shape = np.shape(getattr(self, name))
             if shape not in ((), (n_elements,)):
                 raise ValueError(
@@ -73,6 +95,11 @@ class RodProperties:
         rest = np.shape(self.rest_curvature)
         if len(rest) == 2 and rest[0] != n_elements - 1:
             raise ValueError(f"rest_curvature: expected {n_elements - 1} rows, got {rest[0]}")
+        if not np.max(self.radius) <= self.length / n_elements:
+            raise ValueError(
+                f"radius: expected at most an element's length, {self.length / n_elements:.4g} m,"
+                f" got {np.max(self.radius):.4g} m; take fewer elements"
+            )
 
     @property
     def area(self) -> float | Array:
@@ -87,26 +114,36 @@ class RodProperties:
     @property
     def bending_stiffness(self) -> float | Array:
         """EI [N m^2]."""
+        if self.EI is not None:
+            return self.EI
         return self.youngs_modulus * np.square(self.area) / (4.0 * pi)
 
     @property
     def twisting_stiffness(self) -> float | Array:
         """GJ [N m^2]."""
+        if self.GJ is not None:
+            return self.GJ
         return self.shear_modulus * np.square(self.area) / (2.0 * pi)
 
     @property
     def stretching_stiffness(self) -> float | Array:
         """EA [N]."""
+        if self.EA is not None:
+            return self.EA
         return self.youngs_modulus * self.area
 
     @property
     def shearing_stiffness(self) -> float | Array:
         """kGA [N], k the shear correction factor."""
+        if self.kGA is not None:
+            return self.kGA
         return SHEAR_CORRECTION * self.shear_modulus * self.area
 
     @property
     def linear_density(self) -> float | Array:
         """Mass per length [kg/m]."""
+        if self.mass_per_length is not None:
+            return self.mass_per_length
         return self.density * self.area
 
 

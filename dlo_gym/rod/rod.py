@@ -8,9 +8,14 @@ from numpy.typing import ArrayLike
 from dlo_gym.exceptions import RodDiverged
 from dlo_gym.geometry.curves import parallel_transport
 from dlo_gym.geometry.se3 import Array, exp_so3, log_so3, matrix_to_quaternion
+from dlo_gym.rod import _kernels_dynamics as dynamics_kernels
 from dlo_gym.rod import _kernels_energy as energy_kernels
 from dlo_gym.rod import _kernels_solve as kernels
+from dlo_gym.rod._kernels_assembly import System
+from dlo_gym.rod._kernels_inertia import NO_INERTIA
+from dlo_gym.rod._kernels_rates import kinetic_energy
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
+from dlo_gym.rod.dynamics import clamp_path, motion_of, plan_of
 from dlo_gym.rod.initial_shapes import hanging
 from dlo_gym.rod.properties import RodProperties, per_element
 from dlo_gym.rod.state import RodState
@@ -63,21 +68,29 @@ class CosseratRod:
         if self.gravity.shape != (3,) or not np.isfinite(self.gravity).all():
             raise ValueError(f"gravity: expected three finite numbers [m/s^2], got {gravity}")
         self._arrays = _arrays(properties, n_elements, self.gravity, clamp)
+        self._system = System(self._arrays, NO_INERTIA)
+        self._motion = motion_of(properties, n_elements)
         stiffness = float(self._arrays.bending[:, 0].mean())
         weight = float(np.abs(self._arrays.forces).sum())
         # Differences of coordinates of about 1 m carry this much of rounding error in force.
         element_stiffness = self._arrays.shear[:, 2].max() * n_elements / properties.length
         rounding = 8.0 * np.finfo(np.float64).eps * element_stiffness
-        self._force_scale = stiffness / properties.length**2 + weight + rounding / TOLERANCE
-        self._torque_scale = stiffness / properties.length + weight * properties.length / n_elements
+        self._limits = kernels.Limits(
+            residual=TOLERANCE,
+            force=stiffness / properties.length**2 + weight + rounding / TOLERANCE,
+            torque=stiffness / properties.length + weight * properties.length / n_elements,
+        )
         softest = self._arrays.shear[:, 2].min()
         self._largest_strain = LARGEST_STRAIN + 3.0 * weight / softest
         n_dofs = 6 * n_elements + 3
-        self._gradient = np.zeros(n_dofs)
-        self._band = np.zeros((n_dofs, 9))
-        self._stress = np.zeros((n_elements, 3))
-        self._clamp_terms = np.zeros((2, 4, 3))
+        self._work = energy_kernels.Work(
+            stress=np.zeros((n_elements, 3)),
+            gradient=np.zeros(n_dofs),
+            band=np.zeros((n_dofs, 9)),
+            clamp_terms=np.zeros((2, 4, 3)),
+        )
         self._boundary: BoundaryPoses | None = None
+        self._stop()
 
     @property
     def n_nodes(self) -> int:
@@ -96,6 +109,7 @@ class CosseratRod:
             )
         weight = _weight(self.properties, self.n_elements, self.gravity)
         self._arrays = self._arrays._replace(forces=weight + forces)
+        self._system = self._system._replace(rod=self._arrays)
 
     def settle(self, boundary: BoundaryPoses, start: ArrayLike | None = None) -> RodState:
         """Find the equilibrium between clamps from afar.
@@ -119,6 +133,7 @@ class CosseratRod:
                 f" got shape {start.shape}"
             )
         former = self.state if self._boundary is not None else None
+        self._stop()
         positions = start.copy()
         positions[0] = boundary.left[:3, 3]
         if boundary.right is not None:
@@ -145,12 +160,11 @@ class CosseratRod:
                 rod is long.
             RodDiverged: if the equilibrium was lost; the rod keeps its state before the move.
         """
-        if self._boundary is None:
-            raise ValueError("move: the rod has no state yet; call settle(boundary) first")
-        before = self._boundary
+        before = self._settled("move")
         target = before.displaced(displacement)
         self._check_reach(target)
-        saved = self._x.copy(), self._q.copy()
+        saved = self.state
+        self._v[:], self._w[:] = 0.0, 0.0
         vector = displacement.vector
         full_stride = 1.0 / max(1.0, np.ceil(self._move_size(vector)))
         done, stride = 0.0, full_stride
@@ -165,15 +179,62 @@ class CosseratRod:
                 continue
             problem = self._jump(end)
             if problem:
-                self._set(*saved, before)
-                self._linearise()
+                self.restore(saved)
                 raise RodDiverged(
                     f"the equilibrium was lost at {100 * reached:.0f} % of a move by"
                     f" {np.array2string(vector, precision=4, max_line_width=200)} [m, rad]:"
                     f" {problem}",
-                    last_good=self.state,
+                    last_good=saved,
                 )
             done, stride = reached, full_stride
+        return self.state
+
+    def advance(
+        self,
+        displacement: BoundaryDisplacement,
+        duration: float,
+        *,
+        dt: float = 0.025,
+        order: Literal[1, 2] = 2,
+        tolerance: float | None = None,
+    ) -> RodState:
+        """Let time pass while the clamps move along ``displacement`` with constant velocity.
+
+        Args:
+            displacement: of the clamps; zero to hold them still.
+            duration: [s].
+            dt: largest time step [s]; 10 to 100 ms are stable for any rod.
+            order: 2 for TR-BDF2, 1 for the implicit Euler method, which damps much more.
+            tolerance: on the estimated error of a node's position in one step [m]; steps are
+                chosen to keep it. None takes equal steps.
+
+        Raises:
+            ValueError: naming the argument; or if the rod has not settled, or the clamps would end
+                further apart than the rod is long.
+            RodDiverged: if no step was small enough; the rod keeps its state before.
+        """
+        before = self._settled("advance")
+        plan = plan_of(duration, dt, order, tolerance)
+        target = before.displaced(displacement)
+        self._check_reach(target)
+        saved = self.state
+        status, reached, self._energy = dynamics_kernels.advance(
+            self._system, self._motion, clamp_path(before, displacement, duration), self._ends,
+            self._x, self._q, self._v, self._w, plan, self._limits, self._work,
+        )  # fmt: skip
+        problem = "" if status == kernels.CONVERGED else "no time step was small enough"
+        problem = problem or self._implausible()
+        if problem:
+            self.restore(saved)
+            raise RodDiverged(
+                f"the motion was lost {reached:.4g} s into an advance of {duration:.4g} s:"
+                f" {problem}",
+                last_good=saved,
+            )
+        self._time += duration
+        self._set_clamps(target)
+        kernels.exact_stress(self._arrays, self._x, self._q, self._work.stress)
+        self._linearise()
         return self.state
 
     @property
@@ -183,21 +244,23 @@ class CosseratRod:
         Raises:
             ValueError: if the rod has not settled.
         """
-        if self._boundary is None:
-            raise ValueError("state: the rod has no state yet; call settle(boundary) first")
-        n = self.n_elements
-        strain, curvature = np.empty((n, 3)), np.empty((n - 1, 3))
-        energy_kernels.strains(self._arrays, self._x, self._q, strain, curvature)
+        boundary = self._settled("state")
+        strain, curvature = self._strains()
         wrenches = self._wrenches()
         return RodState(
             positions=self._x.copy(),
             quaternions=self._q.copy(),
             curvature=curvature,
             strain=strain,
-            boundary=self._boundary,
+            boundary=boundary,
             wrench_left=wrenches[0],
             wrench_right=wrenches[1],
             energy=self._energy,
+            stress=self._work.stress.copy(),
+            velocities=self._v.copy(),
+            angular_velocities=self._w.copy(),
+            kinetic_energy=kinetic_energy(self._motion, self._v, self._w),
+            time=self._time,
         )
 
     def restore(self, state: RodState) -> None:
@@ -209,6 +272,9 @@ class CosseratRod:
         if state.n_nodes != self.n_nodes:
             raise ValueError(f"state: expected {self.n_nodes} nodes, got {state.n_nodes}")
         self._set(state.positions.copy(), state.quaternions.copy(), state.boundary)
+        self._v, self._w = state.velocities.copy(), state.angular_velocities.copy()
+        self._time = state.time
+        self._work.stress[:] = state.stress
         self._linearise()
 
     def sensitivity(self) -> Array:
@@ -217,14 +283,21 @@ class CosseratRod:
         Columns are translation [m] and rotation vector [rad] in world axes, of the left clamp, then
         of the right (zero where that end is free). From the factors of the last Newton step.
         """
-        if self._boundary is None:
-            raise ValueError("sensitivity: the rod has no state yet; call settle(boundary) first")
-        columns = np.empty((len(self._gradient), 12))
-        kernels.sensitivity(
-            self._band, self._clamp_terms, self._rotations, self._right_held, columns
-        )
+        self._settled("sensitivity")
+        columns = np.empty((len(self._work.gradient), 12))
+        kernels.sensitivity(self._work, self._rotations, self._ends.right_held, columns)
         positions = np.arange(self.n_nodes)[:, None] * 6 + np.arange(3)
         return columns[positions]
+
+    def _settled(self, action: str) -> BoundaryPoses:
+        """The clamp poses, of a rod that has some."""
+        if self._boundary is None:
+            raise ValueError(f"{action}: the rod has no state yet; call settle(boundary) first")
+        return self._boundary
+
+    def _stop(self) -> None:
+        self._v, self._w = np.zeros((self.n_nodes, 3)), np.zeros((self.n_elements, 3))
+        self._time = 0.0
 
     def _check_reach(self, boundary: BoundaryPoses) -> None:
         if boundary.distance >= self.properties.length:
@@ -239,24 +312,21 @@ class CosseratRod:
 
     def _set_clamps(self, boundary: BoundaryPoses) -> None:
         self._boundary = boundary
-        self._right_held = boundary.right is not None
         right = boundary.left if boundary.right is None else boundary.right
         self._rotations = np.stack([boundary.left[:3, :3], right[:3, :3]])
-        self._clamps = matrix_to_quaternion(self._rotations)
+        frames = matrix_to_quaternion(self._rotations)
+        self._ends = energy_kernels.Ends(frames, boundary.right is not None)
 
     def _linearise(self) -> int:
         self._energy, negative = kernels.linearise(
-            self._arrays, self._x, self._q, self._clamps, self._right_held,
-            self._stress, self._gradient, self._band, self._clamp_terms,
+            self._system, self._x, self._q, self._ends, self._work
         )  # fmt: skip
         return negative
 
     def _minimise(self) -> str:
         """Settle from the present shape; returns what is wrong with the result, or ""."""
         status, steps = kernels.minimise(
-            self._arrays, self._x, self._q, self._clamps, self._right_held,
-            TOLERANCE, self._force_scale, self._torque_scale, 2000,
-            self._stress, self._gradient, self._band, self._clamp_terms,
+            self._system, self._x, self._q, self._ends, self._limits, 2000, self._work
         )  # fmt: skip
         self._linearise()
         if status != kernels.CONVERGED:
@@ -265,7 +335,7 @@ class CosseratRod:
 
     def _follow(self, end: BoundaryPoses, twist: Array) -> bool:
         """One sub-step to ``end``; on failure the rod is as before."""
-        x, q = self._x.copy(), self._q.copy()
+        x, q, stress = self._x.copy(), self._q.copy(), self._work.stress.copy()
         before, energy, wrenches = self._boundary, self._energy, self._wrenches()
         assert before is not None
         rotations = self._rotations
@@ -273,18 +343,18 @@ class CosseratRod:
         full_twist = np.zeros(12)
         full_twist[: len(twist)] = twist
         status, energy_after = kernels.follow(
-            self._arrays, self._x, self._q, self._clamps, self._right_held, full_twist, rotations,
-            TOLERANCE, self._force_scale, self._torque_scale,
-            self._stress, self._gradient, self._band, self._clamp_terms,
+            self._system, self._x, self._q, self._ends, full_twist, rotations, self._limits,
+            self._work,
         )  # fmt: skip
         if status == kernels.CONVERGED:
             # The clamps' work bounds the energy's rise; more means another branch was reached.
             work = 0.5 * full_twist @ (wrenches + self._wrenches()).ravel()
-            slack = abs(work) + 1e-3 * self._torque_scale
+            slack = abs(work) + 1e-3 * self._limits.torque
             if energy_after - energy <= work + slack and not self._implausible():
                 self._energy = energy_after
                 return True
         self._set(x, q, before)
+        self._work.stress[:] = stress
         self._linearise()
         return False
 
@@ -305,9 +375,7 @@ class CosseratRod:
         return self._minimise()
 
     def _implausible(self) -> str:
-        n = self.n_elements
-        strain, curvature = np.empty((n, 3)), np.empty((n - 1, 3))
-        energy_kernels.strains(self._arrays, self._x, self._q, strain, curvature)
+        strain, curvature = self._strains()
         largest = float(np.abs(strain).max())
         if not largest < self._largest_strain:
             return f"an element is strained by {largest:.2g}, beyond {self._largest_strain:.2g}"
@@ -317,14 +385,20 @@ class CosseratRod:
             return f"neighbouring elements bend by {bend:.2g} rad, beyond {LARGEST_BEND:.2g}"
         return ""
 
+    def _strains(self) -> tuple[Array, Array]:
+        """Strain (n, 3) of the elements and curvature (n - 1, 3) at the inner nodes."""
+        strain, curvature = np.empty((self.n_elements, 3)), np.empty((self.n_nodes, 3))
+        energy_kernels.strains(self._arrays, self._x, self._q, self._ends, strain, curvature)
+        return strain, curvature[1:-1].copy()
+
     def _wrenches(self) -> Array:
         """(2, 6) force and torque of the clamps on the rod, world axes."""
         wrenches = np.zeros((2, 6))
-        wrenches[0, :3] = self._gradient[:3]
-        wrenches[0, 3:] = self._rotations[0] @ self._clamp_terms[0, 0]
-        if self._right_held:
-            wrenches[1, :3] = self._gradient[-3:]
-            wrenches[1, 3:] = self._rotations[1] @ self._clamp_terms[1, 0]
+        wrenches[0, :3] = self._work.gradient[:3]
+        wrenches[0, 3:] = self._rotations[0] @ self._work.clamp_terms[0, 0]
+        if self._ends.right_held:
+            wrenches[1, :3] = self._work.gradient[-3:]
+            wrenches[1, 3:] = self._rotations[1] @ self._work.clamp_terms[1, 0]
         return wrenches
 
 
@@ -350,6 +424,7 @@ def _arrays(
     return energy_kernels.RodArrays(
         rest_length,
         np.ascontiguousarray(shear),
+        np.zeros((n, 3)),
         np.concatenate([elements[:1], between, elements[-1:]]),
         np.concatenate([rest[:1], rest, rest[-1:]]),
         voronoi,

@@ -11,7 +11,7 @@ from dlo_gym.rod.boundary import BoundaryPoses
 
 @dataclass(frozen=True, eq=False)
 class RodState:
-    """A rod in equilibrium.
+    """A rod in equilibrium or in motion.
 
     Attributes:
         positions: (n_nodes, 3) centerline in world [m].
@@ -21,8 +21,14 @@ class RodState:
         strain: (n_elements, 3) shear (d1, d2) and stretch (d3) of each element [-].
         boundary: the clamp poses that hold it.
         wrench_left, wrench_right: (6,) force [N] and torque [N m], world axes, that the clamp
-            exerts on the rod at its end node; zero at a free end.
+            exerts on the rod at its end node; zero at a free end. In motion without the part of
+            internal damping.
         energy: elastic plus gravitational [J].
+        stress: (n_elements, 3) internal force along d1, d2 (shear) and d3 (tension) [N].
+        velocities: (n_nodes, 3) in world axes [m/s]; zero in equilibrium.
+        angular_velocities: (n_elements, 3) about d1, d2, d3 of each element [rad/s].
+        kinetic_energy: [J].
+        time: advanced since the rod last settled [s].
     """
 
     positions: Array
@@ -33,6 +39,11 @@ class RodState:
     wrench_left: Array
     wrench_right: Array
     energy: float
+    stress: Array
+    velocities: Array
+    angular_velocities: Array
+    kinetic_energy: float
+    time: float
 
     @property
     def n_nodes(self) -> int:
