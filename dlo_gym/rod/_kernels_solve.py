@@ -173,15 +173,15 @@ def follow(system, x, q, ends, twist, clamp_rotations, limits, work):
     n = q.shape[0]
     n_dofs = 6 * n + 3
     first, last = free_range(n, right_held)
-    step = np.zeros((n_dofs, 1))
+    step = np.zeros(n_dofs)
     prescribed = np.zeros((n_dofs, 1))
     for k in range(3):
         prescribed[k, 0] = twist[k]
         if right_held:
             prescribed[6 * n + k, 0] = twist[6 + k]
     for j in range(first, last):
-        step[j, 0] = -gradient[j]
-    multiply_coupling(band, first, last, prescribed, step)
+        step[j] = -gradient[j]
+    multiply_coupling(band, first, last, prescribed, step.reshape((n_dofs, 1)))
     for side in range(2 if right_held else 1):
         theta = 3 if side == 0 else 6 * n - 3
         for k in range(3):
@@ -189,24 +189,24 @@ def follow(system, x, q, ends, twist, clamp_rotations, limits, work):
             for j in range(3):
                 turn += clamp_rotations[side, j, k] * twist[6 * side + 3 + j]
             for i in range(3):
-                step[theta + i, 0] -= clamp_terms[side, 1 + i, k] * turn
+                step[theta + i] -= clamp_terms[side, 1 + i, k] * turn
     for count in range(NEWTON_STEPS):
-        solve_one(band, first, last, step[:, 0])
+        solve_one(band, first, last, step)
         if count == 0:
             for j in range(n_dofs):
                 if j < first or j >= last:
-                    step[j, 0] = prescribed[j, 0]
-        turn = _largest_turn(step[:, 0], n)
+                    step[j] = prescribed[j, 0]
+        turn = _largest_turn(step, n)
         if not turn < LARGEST_TURN:
             return STALLED, 0.0
-        apply_step(system.rod, x, q, step[:, 0], 1.0, work.stress)
+        apply_step(system.rod, x, q, step, 1.0, work.stress)
         energy = assemble(system, x, q, ends, work, True)
         negative = factorise(band, first, last)
         if _residual(gradient, first, last, limits) < limits.residual:
             return (UNSTABLE if negative else CONVERGED), energy
-        step[:, 0] = 0.0
+        step[:] = 0.0
         for j in range(first, last):
-            step[j, 0] = -gradient[j]
+            step[j] = -gradient[j]
     return STALLED, 0.0
 
 
@@ -225,7 +225,7 @@ def minimise(system, x, q, ends, limits, max_steps, work):
     rotation = limits.torque * n
     translation = rotation / rod.rest_length[0] ** 2
     damping = 1e-3
-    step = np.zeros((n_dofs, 1))
+    step = np.zeros(n_dofs)
     x_trial, q_trial = x.copy(), q.copy()
     exact_stress(rod, x, q, stress)
     energy = assemble(system, x, q, ends, work, True)
@@ -243,17 +243,17 @@ def minimise(system, x, q, ends, limits, max_steps, work):
             if factorise(band, first, last) > 0:
                 damping = max(4.0 * damping, 1e-9)
                 continue
-            step[:, 0] = 0.0
+            step[:] = 0.0
             for j in range(first, last):
-                step[j, 0] = -gradient[j]
+                step[j] = -gradient[j]
                 if residual < tolerance:  # a saddle: leave it in a fixed, generic direction
-                    step[j, 0] = 1e-3 * limits.torque * np.cos(1.0 + 0.7 * j)
-            solve_one(band, first, last, step[:, 0])
-            turn = _largest_turn(step[:, 0], n)
+                    step[j] = 1e-3 * limits.torque * np.cos(1.0 + 0.7 * j)
+            solve_one(band, first, last, step)
+            turn = _largest_turn(step, n)
             scale = min(1.0, 0.5 * LARGEST_TURN / max(turn, 1e-300))
             x_trial[:] = x
             q_trial[:] = q
-            apply_step(rod, x_trial, q_trial, step[:, 0], scale, stress)
+            apply_step(rod, x_trial, q_trial, step, scale, stress)
             trial = assemble(system, x_trial, q_trial, ends, work, False)
             floor = 1e-13 * abs(energy)
             if trial < energy + floor or residual < tolerance:

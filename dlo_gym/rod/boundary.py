@@ -1,11 +1,13 @@
 """What the grippers impose on the rod's ends."""
 
 from dataclasses import dataclass
+from math import dist
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dlo_gym.geometry.se3 import Array, check_single_pose, exp_so3, log_so3
+from dlo_gym.geometry.se3 import Array, check_single_pose, log_so3
+from dlo_gym.rod._kernels_clamps import displace
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +35,7 @@ class BoundaryPoses:
         """Between the two clamps' origins [m]; 0 if one end is free."""
         if self.right is None:
             return 0.0
-        return float(np.linalg.norm(self.right[:3, 3] - self.left[:3, 3]))
+        return dist(self.left[:3, 3], self.right[:3, 3])
 
     def displaced(self, displacement: "BoundaryDisplacement") -> "BoundaryPoses":
         """The poses after ``displacement``."""
@@ -42,8 +44,11 @@ class BoundaryPoses:
                 "displacement: must move the right clamp exactly if it exists, got "
                 f"right={displacement.right} for right clamp {self.right}"
             )
+        poses = object.__new__(BoundaryPoses)  # what is rigid stays so: no need to check again
         right = None if self.right is None else _displace(self.right, displacement.right)
-        return BoundaryPoses(_displace(self.left, displacement.left), right)
+        object.__setattr__(poses, "left", _displace(self.left, displacement.left))
+        object.__setattr__(poses, "right", right)
+        return poses
 
     def displacement_to(self, target: "BoundaryPoses") -> "BoundaryDisplacement":
         """The displacement that takes these poses to ``target``."""
@@ -103,11 +108,8 @@ class BoundaryDisplacement:
 
 def _displace(clamp: Array, twist: Array | None) -> Array:
     assert twist is not None
-    moved = clamp.copy()
-    rotation = exp_so3(twist[3:]) @ clamp[:3, :3]
-    # One Newton step towards the nearest rotation keeps long sequences of moves orthonormal.
-    moved[:3, :3] = 1.5 * rotation - 0.5 * rotation @ rotation.T @ rotation
-    moved[:3, 3] += twist[:3]
+    moved = np.empty((4, 4))
+    displace(clamp, twist, moved)
     return moved
 
 

@@ -12,6 +12,7 @@ from dlo_gym.rod import _kernels_dynamics as dynamics_kernels
 from dlo_gym.rod import _kernels_energy as energy_kernels
 from dlo_gym.rod import _kernels_solve as kernels
 from dlo_gym.rod._kernels_assembly import System
+from dlo_gym.rod._kernels_clamps import clamp_frame
 from dlo_gym.rod._kernels_inertia import NO_INERTIA
 from dlo_gym.rod._kernels_rates import kinetic_energy
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
@@ -164,7 +165,7 @@ class CosseratRod:
         target = before.displaced(displacement)
         self._check_reach(target)
         saved = self.state
-        self._v[:], self._w[:] = 0.0, 0.0
+        self._v, self._w = np.zeros((self.n_nodes, 3)), np.zeros((self.n_elements, 3))
         vector = displacement.vector
         full_stride = 1.0 / max(1.0, np.ceil(self._move_size(vector)))
         done, stride = 0.0, full_stride
@@ -312,9 +313,10 @@ class CosseratRod:
 
     def _set_clamps(self, boundary: BoundaryPoses) -> None:
         self._boundary = boundary
+        self._rotations, frames = np.empty((2, 3, 3)), np.empty((2, 4))
         right = boundary.left if boundary.right is None else boundary.right
-        self._rotations = np.stack([boundary.left[:3, :3], right[:3, :3]])
-        frames = matrix_to_quaternion(self._rotations)
+        clamp_frame(boundary.left, self._rotations[0], frames[0])
+        clamp_frame(right, self._rotations[1], frames[1])
         self._ends = energy_kernels.Ends(frames, boundary.right is not None)
 
     def _linearise(self) -> int:
