@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from benchmarks.validation import buckling, engines, page, statics
+from benchmarks.validation import buckling, dynamics, engines, page, statics
 from benchmarks.validation.case import Case
 
 CASES: dict[str, Callable[[], Case]] = {
@@ -17,6 +17,9 @@ CASES: dict[str, Callable[[], Case]] = {
     "ring": buckling.ring_case,
     "helix": buckling.helix_case,
     "engines": engines.engines_case,
+    "waves": dynamics.waves_case,
+    "time-steps": dynamics.time_steps_case,
+    "moving-clamps": dynamics.moving_clamps_case,
 }
 
 

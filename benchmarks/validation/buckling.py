@@ -5,6 +5,7 @@ twisted ring of Michell (1889; Goriely 2006); the localised helix of a long twis
 van der Heijden and Thompson 2000), which Gazzola et al. (2018) use too.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -44,27 +45,29 @@ def buckling_load(properties: RodProperties, n: int, *, free_end: bool) -> float
         forces[-1, 0] = -load
         rod.apply_forces(forces)
         length = properties.length * (1.0 - load / properties.stretching_stiffness)
-        return linearise(rod, _straight(n, length, free_end)).lowest()[0]
+        return linearise(rod, _straight(rod, length, free_end)).lowest()[0]
 
     return float(brentq(lowest, 0.5 * expected, 1.5 * expected, rtol=1e-10))
 
 
-def _straight(n: int, length: float, free_end: bool) -> RodState:
+def _straight(rod: CosseratRod, length: float, free_end: bool) -> RodState:
     right = AT_ORIGIN.copy()
     right[0, 3] = length
     return _shape(
-        np.linspace(0.0, length, n + 1)[:, None] * [1.0, 0.0, 0.0],
-        np.broadcast_to(AT_ORIGIN[:3, :3], (n, 3, 3)),
+        rod,
+        np.linspace(0.0, length, rod.n_nodes)[:, None] * [1.0, 0.0, 0.0],
+        np.broadcast_to(AT_ORIGIN[:3, :3], (rod.n_elements, 3, 3)),
         BoundaryPoses(AT_ORIGIN, None if free_end else right),
     )
 
 
-def _shape(positions: Array, directors: Array, boundary: BoundaryPoses) -> RodState:
-    """A shape to start from; only its positions, frames and clamps are ever read."""
-    n = len(directors)
-    return RodState(
-        positions, matrix_to_quaternion(directors), np.zeros((n - 1, 3)), np.zeros((n, 3)),
-        boundary, np.zeros(6), np.zeros(6), 0.0,
+def _shape(
+    rod: CosseratRod, positions: Array, directors: Array, boundary: BoundaryPoses
+) -> RodState:
+    """A shape to start from; only its positions, frames and clamps mean anything."""
+    return replace(
+        CosseratRod(rod.properties, rod.n_elements).settle(BoundaryPoses(AT_ORIGIN)),
+        positions=positions, quaternions=matrix_to_quaternion(directors), boundary=boundary,
     )  # fmt: skip
 
 
@@ -113,7 +116,7 @@ def ring(rod: CosseratRod, twist: float) -> RodState:
     right[:3, :3] = right[:3, :3] @ exp_so3([0.0, 0.0, twist])
     nodes = np.concatenate([np.zeros((1, 3)), np.cumsum(edges, axis=0)])
     directors = flat @ exp_so3(turned * [0.0, 0.0, twist])
-    return _shape(nodes, directors, BoundaryPoses(AT_ORIGIN, right))
+    return _shape(rod, nodes, directors, BoundaryPoses(AT_ORIGIN, right))
 
 
 def ring_stiffness(properties: RodProperties, n: int, twist: float) -> Array:
@@ -204,15 +207,16 @@ def localised_helix(
 
 
 def buckled_helix(properties: RodProperties, shortening: float, twist: float, n: int) -> Helix:
-    """The rod shortened, then twisted turn by turn, until it has found the helix by itself."""
+    """The rod shortened and twisted step by step until it has found the helix by itself."""
     rod = CosseratRod(properties, n, gravity=WEIGHTLESS, clamp="node")
+    first = shortening / 30.0
     right = AT_ORIGIN.copy()
-    right[0, 3] = properties.length - shortening
+    right[0, 3] = properties.length - first
     state = rod.settle(BoundaryPoses(AT_ORIGIN, right))
-    turns = int(np.ceil(twist / (2.0 * np.pi)))
-    for _ in range(turns):
-        turn = np.array([0.0, 0.0, 0.0, twist / turns, 0.0, 0.0])
-        state = rod.move(BoundaryDisplacement(np.zeros(6), turn))
+    steps = int(np.ceil(10.0 * twist / (2.0 * np.pi)))
+    step = np.array([-(shortening - first) / steps, 0.0, 0.0, twist / steps, 0.0, 0.0])
+    for _ in range(steps):
+        state = rod.move(BoundaryDisplacement(np.zeros(6), step))
     cosine = state.directors[:, 0, 2]
     middle = int(np.argmin(cosine))
     a, b, c = cosine[middle - 1 : middle + 2]  # the lowest point of the parabola through three

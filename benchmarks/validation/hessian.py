@@ -9,6 +9,7 @@ from scipy.linalg import eig_banded, solve_banded
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod import CosseratRod, RodState
 from dlo_gym.rod import _kernels_energy as energy_kernels
+from dlo_gym.rod._kernels_assembly import assemble
 from dlo_gym.rod._kernels_banded import HALF_BANDWIDTH
 from dlo_gym.rod._kernels_solve import apply_step, exact_stress, free_range
 
@@ -66,21 +67,20 @@ def linearise(rod: CosseratRod, shape: RodState) -> Linearisation:
     """The rod's own energy about ``shape``, which need not be an equilibrium."""
     rod.restore(shape)
     n_dofs = 6 * rod.n_elements + 3
-    gradient, band = np.zeros(n_dofs), np.zeros((n_dofs, HALF_BANDWIDTH + 1))
-    stress = np.zeros((rod.n_elements, 3))
-    exact_stress(rod._arrays, shape.positions, shape.quaternions, stress)
-    energy_kernels.assemble(
-        rod._arrays, shape.positions, shape.quaternions, rod._clamps, rod._right_held,
-        stress, gradient, band, np.zeros((2, 4, 3)), True,
+    work = energy_kernels.Work(
+        np.zeros((rod.n_elements, 3)), np.zeros(n_dofs), np.zeros((n_dofs, HALF_BANDWIDTH + 1)),
+        np.zeros((2, 4, 3)),
     )  # fmt: skip
-    free = slice(*free_range(rod.n_elements, rod._right_held))
+    exact_stress(rod._arrays, shape.positions, shape.quaternions, work.stress)
+    assemble(rod._system, shape.positions, shape.quaternions, rod._ends, work, True)
+    free = slice(*free_range(rod.n_elements, rod._ends.right_held))
     scale = _scale(rod)[free]
-    lower = band[free].T.copy()
+    lower = work.band[free].T.copy()
     for k, diagonal in enumerate(lower):
         inside = len(scale) - k
         diagonal[:inside] /= scale[:inside] * scale[k:]
         diagonal[inside:] = 0.0
-    return Linearisation(gradient[free] / scale, lower)
+    return Linearisation(work.gradient[free] / scale, lower)
 
 
 def _scale(rod: CosseratRod) -> Array:
