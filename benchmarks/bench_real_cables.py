@@ -1,7 +1,7 @@
 """Real cables: identified from some motion-capture clips, predicted in the others.
 
-Mean distance of the inner markers over whole clips of 5 s, predicted from the clamps' motion and how
-the clip began. Says so where the data is absent (see ``deform_mocap``).
+Mean distance of the inner markers over whole clips of 5 s, predicted from the clamps' motion and
+how the clip began. Says so where the data is absent (see ``deform_mocap``).
 """
 
 import numpy as np

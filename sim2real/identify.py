@@ -7,7 +7,7 @@ two dampings; mass is given, and stretch is not asked for.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -263,8 +263,9 @@ def identify(
         moved = [residuals(vector + step) for step in np.diag(steps)]
         return (np.stack(moved, axis=1) - here[:, None]) / steps
 
+    jac: Any = jacobian  # SciPy's stubs only know names of schemes
     found = least_squares(
-        residuals, vector, jacobian, bounds=bounds, loss="soft_l1", f_scale=0.05,
+        residuals, vector, jac, bounds=bounds, loss="soft_l1", f_scale=0.05,
         xtol=1e-3, ftol=1e-3, max_nfev=max_iterations,
     )  # fmt: skip
     error = _standard_error(found.jac, found.fun, motions)
