@@ -12,6 +12,7 @@ from rich.table import Table
 from benchmarks import deform_mocap
 from sim2real.identify import (
     NAMES,
+    STARTS,
     UNITS,
     CableMotion,
     CableParameters,
@@ -22,17 +23,16 @@ from sim2real.identify import (
     predict_blend,
 )
 
-START = CableParameters(3e-3, 0.7, 0.0, 0.0, 2.0, 0.03)
 SECONDS = 2.0  # of each clip that is identified from: later, small errors have grown
 ELEMENTS, ITERATIONS = 16, 5
 
 
 def identify_cable(known: list[CableMotion], progress: Progress, name: str) -> Identified:
     """From the beginnings of the known clips."""
-    total = len(known) * (ITERATIONS * (len(NAMES) + 2))
+    total = len(known) * (len(STARTS) + ITERATIONS * (len(NAMES) + 2))
     task = progress.add_task(f"{name}: identifying", total=total)
     return identify(
-        [motion.beginning(SECONDS) for motion in known], START, ELEMENTS, ITERATIONS,
+        [motion.beginning(SECONDS) for motion in known], None, ELEMENTS, ITERATIONS,
         lambda count, rms: progress.update(
             task, completed=count, description=f"{name}: {1e3 * rms:.0f} mm RMS"
         ),
