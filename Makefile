@@ -14,7 +14,7 @@ export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 export MUJOCO_GL ?= egl
 
-.PHONY: demo demo-robot test test-all bench soak lint clean egl
+.PHONY: demo demo-robot test test-all bench validation soak lint clean egl
 
 demo: $(VENV)/.base egl
 	$(BIN)/dlo demo --out $(OUT) --overwrite
@@ -30,6 +30,9 @@ test-all: lint egl
 
 bench: $(VENV)/.all egl
 	$(BIN)/python -m benchmarks
+
+validation: $(VENV)/.all
+	$(BIN)/python -m benchmarks.validation
 
 soak: $(VENV)/.all egl
 	$(BIN)/python -m benchmarks.soak_robot --minutes 30

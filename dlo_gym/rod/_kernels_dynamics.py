@@ -86,7 +86,7 @@ class Plan(NamedTuple):
 
 
 @njit(cache=True)
-def _set_stage(rod, motion, s, base, ends, stage):
+def set_stage(rod, motion, s, base, ends, stage):
     """Update ``stage`` to springs and viscous stiffness; ``base`` holds b and c."""
     n = base.q.shape[0]
     damping = motion.external * s
@@ -114,7 +114,7 @@ def _set_stage(rod, motion, s, base, ends, stage):
 
 
 @njit(cache=True)
-def _follow_clamps(path, time, ends, now, scratch):
+def follow_clamps(path, time, ends, now, scratch):
     """Update ``ends`` to the clamps at ``time`` and ``scratch`` to their motion from ``now``."""
     n = now.q.shape[0]
     twist, clamps, former = scratch.twist, scratch.clamps, scratch.frames
@@ -140,12 +140,12 @@ def _solve_stage(system, motion, path, s, time, ends, now, scratch, limits, work
     n = now.q.shape[0]
     base, stage = scratch.base, scratch.stage
     x = now.places[: n + 1]
-    _set_stage(system.rod, motion, s, base, ends, stage)
+    set_stage(system.rod, motion, s, base, ends, stage)
     exact_stress(stage.rod, x, now.q, work.stress)
     assemble(stage, x, now.q, ends, work, True)
     first, last = free_range(n, ends.right_held)
     factorise(work.band, first, last)
-    _follow_clamps(path, time, ends, now, scratch)
+    follow_clamps(path, time, ends, now, scratch)
     # Rounding errors grow with the stiffness.
     residual = limits.residual * (1.0 + motion.internal / s)
     looser = Limits(residual, limits.force, limits.torque)

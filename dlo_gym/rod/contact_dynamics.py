@@ -12,6 +12,7 @@ import numpy as np
 
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod import _kernels_dynamics as kernels
+from dlo_gym.rod import _kernels_moment as moments
 from dlo_gym.rod._kernels_assembly import System
 from dlo_gym.rod._kernels_energy import Ends, Work, flow_plastically, strains
 from dlo_gym.rod._kernels_rates import (
@@ -30,7 +31,7 @@ def advance(
     contact: ContactModel,
     obstacles: Sequence[Obstacle] | None,
     system: System,
-    motion: kernels.Motion,
+    motion: moments.Motion,
     path: ClampPath,
     ends: Ends,
     state: tuple[Array, Array, Array, Array, Array],
@@ -46,24 +47,24 @@ def advance(
     """
     x, q, v, w, creep = state
     n = len(q)
-    now, scratch = kernels._empty_moment(n), kernels._scratch(system, n)
+    now, scratch = moments.empty_moment(n), moments.empty_scratch(system, n)
     now.places[: n + 1], now.speeds[: n + 1] = x, v
     now.q[:], now.w[:] = q, w
     directors(now.q, now.places)
     director_velocities(now.q, now.w, now.speeds)
-    kernels._hold(path, ends, now)
+    moments.hold(path, ends, now)
     now.creep[:] = creep
-    if kernels._inelastic(motion):
+    if moments.inelastic(motion):
         strains(system.rod, now.places, now.q, ends, now.strain[:n], now.strain[n:])
         flow_plastically(system.rod, now.strain[n:], now.plastic)
-        kernels._set_material(system, motion, now)
+        moments.set_material(system, motion, now)
     standing = contact.obstacles
     still = obstacles is None and not path.velocity.any()
     places = now.places[: n + 1]
 
     def stored() -> float:
         exact_stress(system.rod, places, now.q, work.stress)
-        hidden = kernels.hidden_energy(motion, system.rod, now.creep, now.plastic)
+        hidden = moments.hidden_energy(motion, system.rod, now.creep, now.plastic)
         return contact.linearise((system, places, now.q, ends), work)[0] + hidden
 
     energy = stored() + kinetic_energy(motion, now.speeds, now.w)
@@ -73,7 +74,7 @@ def advance(
         final = h > (plan.duration - time) * (1.0 - 1e-9)
         h = plan.duration - time if final else h
         reached = plan.duration if final else time + h
-        kernels._copy(now, scratch.before)
+        moments.copy_moment(now, scratch.before)
         frames, saved = ends.frames.copy(), contact.save()
         bodies = None
         if obstacles is not None:
@@ -91,8 +92,8 @@ def advance(
                 now.w[:] *= sqrt(max(0.0, 1.0 - gain / kinetic))
             energy += min(gain, 0.0)
         if not accepted:
-            kernels._copy(scratch.before, now)
-            kernels._set_material(system, motion, now)
+            moments.copy_moment(scratch.before, now)
+            moments.set_material(system, motion, now)
             ends.frames[:] = frames
             contact.load(saved)
             h *= 0.5
@@ -111,13 +112,13 @@ def _step(
     """Update ``now`` to ``time`` [s], a step of ``h`` [s]; whether a solution was found."""
     n = len(now.q)
     x, stage = now.places[: n + 1], scratch.stage
-    kernels._copy(scratch.before, scratch.base)
-    kernels._set_stage(system.rod, motion, h, scratch.base, ends, stage)
+    moments.copy_moment(scratch.before, scratch.base)
+    kernels.set_stage(system.rod, motion, h, scratch.base, ends, stage)
     shape = stage, x, now.q, ends
     contact.linearise(shape, work)
     # Rounding errors grow with the stiffness.
     limits = limits._replace(residual=limits.residual * (1.0 + motion.internal / h))
-    kernels._follow_clamps(path, time, ends, now, scratch)
+    kernels.follow_clamps(path, time, ends, now, scratch)
     status, _ = contact.follow(shape, scratch.twist, scratch.rotations, obstacles, limits, work)
     if status != CONVERGED or not np.isfinite(now.places).all():
         return False
@@ -126,9 +127,9 @@ def _step(
         x[n] = scratch.clamps[1]
     directors(now.q, now.places)
     now.speeds[:] = (now.places - scratch.base.places) / h
-    kernels._hold(path, ends, now)
-    if kernels._inelastic(motion):
-        kernels._flow(system, motion, h, scratch.base, stage, ends, now)
+    moments.hold(path, ends, now)
+    if moments.inelastic(motion):
+        moments.flow(system, motion, h, scratch.base, stage, ends, now)
     angular_velocities(now.q, now.speeds, now.w)
     director_velocities(now.q, now.w, now.speeds)
     return True
