@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, eigh, lapack
+from scipy.linalg import LinAlgError, eigh, get_lapack_funcs
 
 from dlo_gym.geometry.camera import CameraModel
 from dlo_gym.geometry.se3 import Array
@@ -25,6 +25,8 @@ SIGHT_NOISE = 3e-4  # of a seen centerline, across
 BEND_NOISE = 1.2e-4  # second difference of the correction, per squared 10 mm of element length
 LENGTH_NOISE = 3e-5  # of an element's length, beside the others'
 STRETCH = 0.01  # standard deviation of the whole curve's stretch [-]
+
+_POSV, _POTRF, _POTRI = get_lapack_funcs(("posv", "potrf", "potri"), dtype=np.float64)
 
 
 def ray_projectors(directions: Array) -> Array:
@@ -132,7 +134,7 @@ def fit_curve(
         if not len(free):
             break
         reduced = matrix.reshape(3 * n, 3 * n)[np.ix_(unknown, unknown)]
-        _, step, info = lapack.dposv(reduced, gradient.ravel()[unknown], lower=True)
+        _, step, info = _POSV(reduced, gradient.ravel()[unknown], lower=True)
         _check_definite(info)
         curve = curve.copy()
         curve[free] -= step.reshape(-1, 3)
@@ -157,9 +159,9 @@ class CurveFit(NamedTuple):
         unknown = (3 * self.free[:, None] + np.arange(3)).ravel()
         deviation = np.zeros(len(self.centerline))
         if len(unknown):
-            factor, info = lapack.dpotrf(self.information[np.ix_(unknown, unknown)], lower=True)
+            factor, info = _POTRF(self.information[np.ix_(unknown, unknown)], lower=True)
             _check_definite(info)
-            covariance, _ = lapack.dpotri(factor, lower=True)
+            covariance, _ = _POTRI(factor, lower=True)
             deviation[self.free] = np.sqrt(np.diag(covariance).reshape(-1, 3).sum(axis=1))
         return deviation
 
