@@ -38,7 +38,7 @@ def advance(
     limits: Limits,
     work: Work,
 ) -> tuple[int, float]:
-    """Update ``state``, nodes, quaternions, velocities, angular velocities and creep, along ``path``.
+    """Update ``state``, x, q, v, w and creep (see ``_kernels_dynamics``), along ``path``.
 
     Steps are halved where no solution is found, or, between clamps and obstacles that hold still,
     where energy appears from nowhere; what little is left of such a gain is taken from the
