@@ -5,6 +5,7 @@ from gymnasium.envs.registration import register
 register(
     id="dlo_gym/ShapeControl-v0",
     entry_point="dlo_gym.envs.shape_env:ShapeControlEnv",
+    vector_entry_point="dlo_gym.envs.vector_env:ShapeControlVectorEnv",
     max_episode_steps=100,
 )
 register(

@@ -49,12 +49,17 @@ class ClampAction:
             raise ValueError(
                 f"action: expected {self.size} numbers in [-1, 1] without NaN, got {action}"
             )
-        parts = (np.clip(action, -1.0, 1.0) * self.scale).reshape(2, -1)
-        twists = [
-            np.concatenate([part[:3], clamp[:3, : self.n_rotations] @ part[3:]])
-            for part, clamp in zip(parts, _clamps(boundary), strict=True)
-        ]
+        twists = self.to_twists(action, np.stack(_clamps(boundary)))
         return BoundaryDisplacement(*twists)
+
+    def to_twists(self, actions: Array, clamps: Array) -> Array:
+        """Twists (..., 2, 6) [m], [rad], world axes, that ``actions`` (..., size) stand for at
+        clamp poses (..., 2, 4, 4); unchecked, clipped to [-1, 1]."""
+        parts = np.clip(actions, -1.0, 1.0) * self.scale
+        parts = parts.reshape(*actions.shape[:-1], 2, -1)
+        axes = clamps[..., :3, : self.n_rotations]
+        turns = (axes @ parts[..., 3:, None])[..., 0]
+        return np.concatenate([parts[..., :3], turns], axis=-1)
 
     def to_action(self, displacement: BoundaryDisplacement, boundary: BoundaryPoses) -> Array:
         """The action (size,) closest to ``displacement``: cut to the limits component by component,

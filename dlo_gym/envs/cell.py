@@ -127,17 +127,24 @@ class SimulatedCell:
         self._show(0.0)
         return self._rod_state
 
-    def move(self, displacement: BoundaryDisplacement) -> RodState:
+    def move(
+        self, displacement: BoundaryDisplacement, joint_angles: Array | None = None
+    ) -> RodState:
         """Move the clamps, let the rod follow and the clock go on.
 
         Nothing has changed if this raises.
+
+        Args:
+            displacement: of the clamps.
+            joint_angles: (2, 6) [rad] that hold the moved clamps, where they are known already.
 
         Raises:
             ValueError: if the clamps would be further apart than the rod is long.
             UnreachablePose: if an arm cannot follow.
             RodDiverged: if the rod's equilibrium was lost.
         """
-        joint_angles = self._reach(self.boundary.displaced(displacement), self.joint_angles)
+        if joint_angles is None:
+            joint_angles = self._reach(self.boundary.displaced(displacement), self.joint_angles)
         self._rod_state = self.rod.move(displacement)
         self.joint_angles = joint_angles
         self._show(self.stamp + self.control_step)

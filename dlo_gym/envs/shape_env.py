@@ -9,7 +9,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from dlo_gym.envs import tasks
-from dlo_gym.envs.actions import ClampAction, clamp_numbers
+from dlo_gym.envs.actions import ClampAction
 from dlo_gym.envs.cell import SimulatedCell, sample_occluder_paths
 from dlo_gym.envs.config import ShapeEnvConfig
 from dlo_gym.envs.observers import make_observer
@@ -188,9 +188,7 @@ class ShapeControlEnv(gym.Env):
         termination = tasks.advance(self.cell, displacement, self.config)
         if self.cell.boundary is before:  # refused
             displacement = BoundaryDisplacement.zero()
-        try:
-            self._estimate = self._observer.update(self.cell, displacement)
-        except TrackLost:
+        if not self.observe(displacement):
             termination = termination or "track_lost"
         observation = self._observation()
         info = self._info(displacement, termination)
@@ -198,6 +196,14 @@ class ShapeControlEnv(gym.Env):
             observation["achieved_goal"], observation["desired_goal"], info
         )
         return observation, float(reward), bool(termination), False, info
+
+    def observe(self, displacement: BoundaryDisplacement) -> bool:
+        """Look at the cell after its clamps have moved; False if the rod is lost from sight."""
+        try:
+            self._estimate = self._observer.update(self.cell, displacement)
+        except TrackLost:
+            return False
+        return True
 
     def compute_reward(
         self,
@@ -294,11 +300,19 @@ def shape_observation(
     centerline: Array, boundary: BoundaryPoses, goal: Array
 ) -> dict[str, NDArray]:
     """The observation of a centerline (n, 3) [m] held at ``boundary``, for a goal (n, 3) [m]."""
-    clamps = [clamp_numbers(clamp) for clamp in (boundary.left, boundary.right)]
+    return flat_observation(centerline, boundary.clamps, goal)
+
+
+def flat_observation(centerlines: Array, clamps: Array, goals: Array) -> dict[str, NDArray]:
+    """Observations of centerlines (..., n, 3) [m] held at clamps (..., k, 4, 4), for goals
+    (..., n, 3) [m]."""
+    batch = centerlines.shape[:-2]
+    points = centerlines.reshape(*batch, -1)
+    held = clamps[..., :3, [3, 0, 2]].swapaxes(-1, -2).reshape(*batch, -1)
     return {
-        "observation": np.concatenate([centerline.ravel(), *clamps]).astype(np.float32),
-        "achieved_goal": centerline.ravel().astype(np.float32),
-        "desired_goal": goal.ravel().astype(np.float32),
+        "observation": np.concatenate([points, held], axis=-1).astype(np.float32),
+        "achieved_goal": points.astype(np.float32),
+        "desired_goal": goals.reshape(*batch, -1).astype(np.float32),
     }
 
 

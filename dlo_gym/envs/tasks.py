@@ -12,7 +12,8 @@ from dlo_gym.envs.config import ShapeEnvConfig
 from dlo_gym.exceptions import RodDiverged, UnreachablePose
 from dlo_gym.geometry.se3 import Array, exp_so3, pose
 from dlo_gym.metrics import ptp_3d
-from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
+from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses, displace
+from dlo_gym.scene.clearance import clearance
 
 DENSE_UNIT = 0.1  # mean node error that costs 1 per step [m]
 ATTEMPTS = 200
@@ -81,23 +82,69 @@ def advance(cell: SimulatedCell, displacement: BoundaryDisplacement, config: Sha
 
     A motion that cannot be made leaves the cell as it was.
     """
-    distance = _distance_after(cell.boundary, displacement)
+    return advance_all([cell], displacement.vector.reshape(1, -1, 6), config)[0]
+
+
+def advance_all(
+    cells: Sequence[SimulatedCell], twists: Array, config: ShapeEnvConfig
+) -> list[str]:
+    """``advance`` of each of n cells by twists (n, k, 6) [m], [rad] of their k clamps.
+
+    What the arms do is worked out for all cells at once.
+    """
+    clamps = np.stack([cell.boundary.clamps for cell in cells])
+    reasons = _clamps_apart(cells, clamps[..., :3, 3] + twists[..., :3], config)
+    joint_angles: Sequence[Array | None] = [None] * len(cells)
+    arms = cells[0].arms
+    if arms is not None:
+        guesses = np.stack([_joint_angles(cell) for cell in cells])
+        joint_angles = arms.reach(displace(clamps, twists), guesses)
+    for i, (cell, twist, angles) in enumerate(zip(cells, twists, joint_angles, strict=True)):
+        reasons[i] = reasons[i] or _move(cell, twist, angles)
+    moved = [i for i, reason in enumerate(reasons) if not reason]
+    if arms is not None and moved:
+        gaps = clearance(arms.T_world_base, np.stack([_joint_angles(cells[i]) for i in moved]))
+        for i, touching in zip(moved, gaps.smallest < 0.0, strict=True):
+            reasons[i] = "collision" if touching else ""
+    for i in moved:
+        lowest = cells[i].rod_state.positions[:, 2].min()
+        if not reasons[i] and lowest < np.max(cells[i].properties.radius):
+            reasons[i] = "table_contact"
+    return reasons
+
+
+def _clamps_apart(
+    cells: Sequence[SimulatedCell], ends: Array, config: ShapeEnvConfig
+) -> list[str]:
+    """Which of the cells' clamps at ``ends`` (n, k, 3) [m] are too far apart or too near."""
+    if ends.shape[1] == 1:
+        return [""] * len(cells)
+    distances = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    longest = config.max_stretch * np.array([cell.properties.length for cell in cells])
     # A command that the safety gate cut to a limit stands on it up to rounding.
-    if distance > config.max_stretch * config.properties.length + 1e-9:
-        return "overstretch"
-    if distance < config.min_gripper_distance - 1e-9:
-        return "collision"
+    return [
+        "overstretch" if far else ("collision" if near else "")
+        for far, near in zip(
+            distances > longest + 1e-9, distances < config.min_gripper_distance - 1e-9, strict=True
+        )
+    ]
+
+
+def _move(cell: SimulatedCell, twist: Array, joint_angles: Array | None) -> str:
+    if joint_angles is not None and np.isnan(joint_angles).any():
+        return "unreachable"
     try:
-        state = cell.move(displacement)
+        cell.move(BoundaryDisplacement(*twist), joint_angles)
     except UnreachablePose:
         return "unreachable"
     except RodDiverged:
         return "rod_diverged"
-    if cell.arms_in_collision():
-        return "collision"
-    if state.positions[:, 2].min() < np.max(config.properties.radius):
-        return "table_contact"
     return ""
+
+
+def _joint_angles(cell: SimulatedCell) -> Array:
+    assert cell.joint_angles is not None
+    return cell.joint_angles
 
 
 def reset_to_random_start(
@@ -153,15 +200,6 @@ def sample_goal(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvC
         f" goal_moves={config.goal_moves}, goal_translation={config.goal_translation} [m],"
         f" goal_rotation={config.goal_rotation} [rad]"
     )
-
-
-def _distance_after(boundary: BoundaryPoses, displacement: BoundaryDisplacement) -> float:
-    """Between the clamps' origins once they have moved [m]."""
-    assert boundary.right is not None
-    assert displacement.right is not None
-    left = boundary.left[:3, 3] + displacement.left[:3]
-    right = boundary.right[:3, 3] + displacement.right[:3]
-    return float(np.linalg.norm(right - left))
 
 
 def _random_start(rng: np.random.Generator, config: ShapeEnvConfig) -> BoundaryPoses:

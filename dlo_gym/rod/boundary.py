@@ -29,6 +29,11 @@ class BoundaryPoses:
             object.__setattr__(self, "right", check_single_pose(self.right, "clamp right"))
 
     @property
+    def clamps(self) -> Array:
+        """(2, 4, 4) left then right, or (1, 4, 4) if the right end is free."""
+        return np.stack([self.left] if self.right is None else [self.left, self.right])
+
+    @property
     def distance(self) -> float:
         """Between the two clamps' origins [m]; 0 if one end is free."""
         if self.right is None:
@@ -42,8 +47,16 @@ class BoundaryPoses:
                 "displacement: must move the right clamp exactly if it exists, got "
                 f"right={displacement.right} for right clamp {self.right}"
             )
-        right = None if self.right is None else _displace(self.right, displacement.right)
-        return BoundaryPoses(_displace(self.left, displacement.left), right)
+        twists = displacement.vector.reshape(-1, 6)
+        return BoundaryPoses.of_rigid(*displace(self.clamps, twists))
+
+    @classmethod
+    def of_rigid(cls, left: Array, right: Array | None = None) -> "BoundaryPoses":
+        """From float64 poses that are rigid already; not checked again."""
+        poses = object.__new__(cls)
+        object.__setattr__(poses, "left", left)
+        object.__setattr__(poses, "right", right)
+        return poses
 
     def displacement_to(self, target: "BoundaryPoses") -> "BoundaryDisplacement":
         """The displacement that takes these poses to ``target``."""
@@ -101,13 +114,14 @@ class BoundaryDisplacement:
         return BoundaryDisplacement.from_vector(factor * self.vector)
 
 
-def _displace(clamp: Array, twist: Array | None) -> Array:
-    assert twist is not None
-    moved = clamp.copy()
-    rotation = exp_so3(twist[3:]) @ clamp[:3, :3]
+def displace(clamps: Array, twists: Array) -> Array:
+    """Clamp poses (..., 4, 4) moved by twists (..., 6) [m], [rad], each as a
+    ``BoundaryDisplacement`` has it."""
+    moved = clamps.copy()
+    rotation = exp_so3(twists[..., 3:]) @ clamps[..., :3, :3]
     # One Newton step towards the nearest rotation keeps long sequences of moves orthonormal.
-    moved[:3, :3] = 1.5 * rotation - 0.5 * rotation @ rotation.T @ rotation
-    moved[:3, 3] += twist[:3]
+    moved[..., :3, :3] = 1.5 * rotation - 0.5 * rotation @ np.swapaxes(rotation, -1, -2) @ rotation
+    moved[..., :3, 3] += twists[..., :3]
     return moved
 
 

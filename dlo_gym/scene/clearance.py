@@ -50,7 +50,13 @@ class Clearance(NamedTuple):
 
     @property
     def minimum(self) -> float:
-        return min(float(np.min(distances)) for distances in self)
+        return float(np.min(self.smallest))
+
+    @property
+    def smallest(self) -> Array:
+        """(...) the smallest of the distances of each pair of arms [m]."""
+        own = np.minimum(self.to_table, self.within_arm).min(axis=-1)
+        return np.minimum(self.between_arms, own)
 
 
 def capsule_axes(T_world_base: Array, joint_angles: Array) -> Array:
