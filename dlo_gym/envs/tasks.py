@@ -85,9 +85,7 @@ def advance(cell: SimulatedCell, displacement: BoundaryDisplacement, config: Sha
     return advance_all([cell], displacement.vector.reshape(1, -1, 6), config)[0]
 
 
-def advance_all(
-    cells: Sequence[SimulatedCell], twists: Array, config: ShapeEnvConfig
-) -> list[str]:
+def advance_all(cells: Sequence[SimulatedCell], twists: Array, config: ShapeEnvConfig) -> list[str]:
     """``advance`` of each of n cells by twists (n, k, 6) [m], [rad] of their k clamps.
 
     What the arms do is worked out for all cells at once.
@@ -113,9 +111,7 @@ def advance_all(
     return reasons
 
 
-def _clamps_apart(
-    cells: Sequence[SimulatedCell], ends: Array, config: ShapeEnvConfig
-) -> list[str]:
+def _clamps_apart(cells: Sequence[SimulatedCell], ends: Array, config: ShapeEnvConfig) -> list[str]:
     """Which of the cells' clamps at ``ends`` (n, k, 3) [m] are too far apart or too near."""
     if ends.shape[1] == 1:
         return [""] * len(cells)

@@ -141,9 +141,7 @@ class ShapeControlVectorEnv(VectorEnv):
         for env in self.envs:
             env.close()
 
-    def compute_reward(
-        self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
-    ) -> Any:
+    def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any) -> Any:
         """As a single environment's."""
         return self.envs[0].compute_reward(achieved_goal, desired_goal, info)
 
@@ -235,5 +233,7 @@ def _reset_mask(mask: Any, n: int) -> NDArray[np.bool_]:
         return np.ones(n, dtype=bool)
     mask = np.asarray(mask)
     if mask.shape != (n,) or mask.dtype != bool or not mask.any():
-        raise ValueError(f"reset_mask: expected {n} booleans, at least one of them true, got {mask}")
+        raise ValueError(
+            f"reset_mask: expected {n} booleans, at least one of them true, got {mask}"
+        )
     return mask
