@@ -81,11 +81,19 @@ class ShapeControlVectorEnv(VectorEnv):
         """
         options = dict(options or {})
         mask = _reset_mask(options.pop("reset_mask", None), self.num_envs)
+        return self.reset_each(_seeds(seed, self.num_envs), [options] * self.num_envs, mask)
+
+    def reset_each(
+        self,
+        seeds: Sequence[int | None],
+        options: Sequence[dict[str, Any]],
+        mask: NDArray[np.bool_],
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start an episode where ``mask`` (n,) says so, each with a seed and options of its own."""
         infos: dict[str, Any] = {}
-        for i, own in enumerate(_seeds(seed, self.num_envs)):
-            if mask[i]:
-                _, info = self.envs[i].reset(seed=own, options=options)
-                infos = self._add_info(infos, info, i)
+        for i in np.flatnonzero(mask):
+            _, info = self.envs[i].reset(seed=seeds[i], options=options[i])
+            infos = self._add_info(infos, info, int(i))
         if self._over is None:
             self._over = np.zeros(self.num_envs, dtype=bool)
         self._steps[mask], self._over[mask] = 0, False
@@ -149,8 +157,8 @@ class ShapeControlVectorEnv(VectorEnv):
         actions = np.asarray(actions, dtype=np.float64)
         if actions.shape != self.action_space.shape or np.isnan(actions).any():
             raise ValueError(
-                f"actions: expected numbers in [-1, 1] without NaN, shape {self.action_space.shape},"
-                f" got {actions}"
+                f"actions: expected numbers in [-1, 1] without NaN of shape"
+                f" {self.action_space.shape}, got {actions}"
             )
         return actions
 
