@@ -12,6 +12,7 @@ from dlo_gym.rod.properties import RodProperties
 CHOICES = {
     "observation_mode": ("state", "images"),
     "reward": ("dense", "sparse"),
+    "straight_way": ("any", "blocked"),
     "clutter": ("none", "industrial"),
     "quality": ("fast", "high"),
 }
@@ -41,6 +42,8 @@ class ShapeEnvConfig:
         goal_translation: half-range of the clamps' positions over these motions [m].
         goal_rotation: largest rotation about each clamp axis in one of these motions [rad].
         goal_distance: smallest and largest mean node distance between start and goal [m].
+        straight_way: ``"blocked"`` takes only goals where arms or grippers would collide, or not
+            reach, if both clamps went straight there.
         max_stretch: largest distance between the clamps, in lengths of the rod.
         min_gripper_distance: smallest distance between the clamps [m].
         workspace: lowest and highest clamp position (2, 3), world [m].
@@ -75,6 +78,7 @@ class ShapeEnvConfig:
     goal_translation: float = 0.12
     goal_rotation: float = float(np.deg2rad(30.0))
     goal_distance: tuple[float, float] = (0.06, 0.25)
+    straight_way: Literal["any", "blocked"] = "any"
     max_stretch: float = 0.98
     min_gripper_distance: float = 0.05
     workspace: tuple[tuple[float, float, float], tuple[float, float, float]] = (
@@ -123,6 +127,8 @@ class ShapeEnvConfig:
                 "goal_distance: expected a smallest below a largest distance [m],"
                 f" got {self.goal_distance}"
             )
+        if self.straight_way == "blocked" and not self.check_arms:
+            raise ValueError('straight_way: "blocked" is about the arms, expected check_arms=True')
         if self.max_stretch >= 1.0:
             raise ValueError(f"max_stretch: expected a fraction below 1, got {self.max_stretch}")
         if not all(isinstance(camera, CameraModel) for camera in self.cameras):

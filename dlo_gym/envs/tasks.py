@@ -17,6 +17,8 @@ from dlo_gym.scene.clearance import clearance
 
 DENSE_UNIT = 0.1  # mean node error that costs 1 per step [m]
 ATTEMPTS = 200
+BLOCKED_ATTEMPTS = 5000  # of which one in some hundred is blocked, at a millisecond each
+DETOURS = 10  # tried per blocked way
 GOAL_STRETCH = 0.95  # of the largest distance between the clamps, at the goal
 
 
@@ -179,7 +181,7 @@ def sample_goal(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvC
     """
     start = cell.save()
     try:
-        for _ in range(ATTEMPTS):
+        for _ in range(BLOCKED_ATTEMPTS if config.straight_way == "blocked" else ATTEMPTS):
             cell.restore(start)
             if not _wander(cell, start.rod.boundary, rng, config):
                 continue
@@ -216,22 +218,83 @@ def _wander(
     config: ShapeEnvConfig,
 ) -> bool:
     """Follow ``goal_moves`` random motions in steps; False if one of them is not allowed."""
+    if config.straight_way == "blocked":
+        return _detour(cell, rng, config)
+    return all(
+        _follow(cell, _random_motion(cell.boundary, start, rng, config), config)
+        for _ in range(config.goal_moves)
+    )
+
+
+def _detour(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvConfig) -> bool:
+    """Follow a random motion whose straight way is blocked, around over a translation to somewhere
+    else; False if none of some is allowed."""
+    start = cell.save()
+    boundary = start.rod.boundary
+    motion = _random_motion(boundary, boundary, rng, config)
+    if not straight_way_blocked(cell, boundary.displaced(motion), config):
+        return False
+    for _ in range(DETOURS):
+        around = _random_motion(boundary, boundary, rng, config).vector.reshape(2, 6)
+        around[:, 3:] = 0.0
+        legs = [BoundaryDisplacement(*around), BoundaryDisplacement(*(motion.vector.reshape(2, 6) - around))]
+        cell.restore(start)
+        if all(_follow(cell, leg, config) for leg in legs):
+            return True
+    return False
+
+
+def straight_way_blocked(cell: SimulatedCell, goal: BoundaryPoses, config: ShapeEnvConfig) -> bool:
+    """Whether the arms can hold ``goal``, but would collide or not reach on the straight way of
+    the cell's clamps to it."""
+    guess = cell.joint_angles
+    if cell.arms is None or guess is None:
+        return False
+    motion = cell.boundary.displacement_to(goal)
+    n_steps = _n_steps(motion, config)
+    shares = np.arange(1, n_steps + 1)[:, None, None] / n_steps
+    starts = np.repeat(cell.boundary.clamps[None], n_steps, axis=0)
+    clamps = displace(starts, shares * motion.vector.reshape(-1, 6))
+    joint_angles = np.empty((n_steps, 2, 6))
+    for i in range(n_steps):
+        joint_angles[i] = cell.arms.reach(clamps[i], guess)
+        guess = np.where(np.isnan(joint_angles[i]), guess, joint_angles[i])
+    reached = ~np.isnan(joint_angles).any(axis=(1, 2))
+    gaps = clearance(cell.arms.T_world_base, np.nan_to_num(joint_angles)).smallest
+    passable = reached & (gaps >= 0.0)
+    return bool(passable[-1] and not passable.all())
+
+
+def _random_motion(
+    boundary: BoundaryPoses,
+    start: BoundaryPoses,
+    rng: np.random.Generator,
+    config: ShapeEnvConfig,
+) -> BoundaryDisplacement:
+    """From ``boundary`` to somewhere around ``start``."""
     low, high = np.asarray(config.workspace)
-    starts = np.stack([start.left[:3, 3], start.right[:3, 3]])  # type: ignore[index]
-    for _ in range(config.goal_moves):
-        together = rng.uniform(-1.0, 1.0, 3)
-        apart = rng.uniform(-0.5, 0.5, (2, 3))
-        targets = np.clip(starts + config.goal_translation * (together + apart), low, high)
-        rotations = rng.uniform(-1.0, 1.0, (2, 2)) * config.goal_rotation
-        clamps = (cell.boundary.left, cell.boundary.right)
-        twists = [
-            np.concatenate([target - clamp[:3, 3], clamp[:3, :2] @ rotation])  # type: ignore[index]
-            for clamp, target, rotation in zip(clamps, targets, rotations, strict=True)
-        ]
-        motion = BoundaryDisplacement(*twists)
-        translation = np.abs(np.stack(twists)[:, :3]).max() / config.max_translation_step
-        n_steps = int(np.ceil(max(translation, np.abs(rotations).max() / config.max_rotation_step)))
-        for _ in range(n_steps):
-            if advance(cell, motion.scaled(1.0 / n_steps), config):
-                return False
-    return True
+    together = rng.uniform(-1.0, 1.0, 3)
+    apart = rng.uniform(-0.5, 0.5, (2, 3))
+    offsets = config.goal_translation * (together + apart)
+    targets = np.clip(start.clamps[:, :3, 3] + offsets, low, high)
+    rotations = rng.uniform(-1.0, 1.0, (2, 2)) * config.goal_rotation
+    twists = [
+        np.concatenate([target - clamp[:3, 3], clamp[:3, :2] @ rotation])
+        for clamp, target, rotation in zip(boundary.clamps, targets, rotations, strict=True)
+    ]
+    return BoundaryDisplacement(*twists)
+
+
+def _n_steps(motion: BoundaryDisplacement, config: ShapeEnvConfig) -> int:
+    """How many steps a motion takes within the limits."""
+    twists = np.abs(motion.vector.reshape(-1, 6))
+    largest = max(
+        twists[:, :3].max() / config.max_translation_step,
+        twists[:, 3:].max() / config.max_rotation_step,
+    )
+    return max(1, int(np.ceil(largest)))
+
+
+def _follow(cell: SimulatedCell, motion: BoundaryDisplacement, config: ShapeEnvConfig) -> bool:
+    step = motion.scaled(1.0 / _n_steps(motion, config))
+    return not any(advance(cell, step, config) for _ in range(_n_steps(motion, config)))
