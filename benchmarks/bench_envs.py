@@ -34,7 +34,7 @@ class StraightServo:
             turn = np.cross(clamp[:3, 2], tangent / np.linalg.norm(tangent))
             twists.append(np.concatenate([position - clamp[:3, 3], turn]))
         largest = max(np.abs(twist[:3]).max() for twist in twists)
-        return BoundaryDisplacement(*twists).scaled(min(1.0, 0.01 / largest))
+        return BoundaryDisplacement(*twists).scaled(0.01 / max(largest, 0.01))
 
 
 def main() -> None:

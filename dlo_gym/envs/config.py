@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from dlo_gym.envs.randomization import Randomization
 from dlo_gym.geometry.camera import CameraModel
 from dlo_gym.rod.properties import RodProperties
 
@@ -33,6 +34,7 @@ class ShapeEnvConfig:
         max_translation_step: largest motion of a clamp along each world axis in one step [m].
         max_rotation_step: largest rotation of a clamp about each of its axes in one step [rad].
         axial_rotation: whether the action also turns the clamps about the rod's own axis.
+        randomization: what every reset samples anew; None for nothing.
         reward: ``"dense"`` or ``"sparse"``.
         success_threshold: mean node error that counts as success [m].
         termination_penalty: taken off the reward of the step that ends an episode early.
@@ -68,6 +70,7 @@ class ShapeEnvConfig:
     max_translation_step: float = 0.01
     max_rotation_step: float = float(np.deg2rad(4.5))
     axial_rotation: bool = False
+    randomization: Randomization | None = None
     reward: Literal["dense", "sparse"] = "dense"
     success_threshold: float = 0.005
     termination_penalty: float = 20.0
@@ -106,6 +109,8 @@ class ShapeEnvConfig:
             )
         if not isinstance(self.properties, RodProperties):
             raise ValueError(f"properties: expected RodProperties, got {self.properties!r}")
+        if not isinstance(self.randomization, Randomization | None):
+            raise ValueError(f"randomization: expected Randomization, got {self.randomization!r}")
         for name in (
             "control_step", "max_translation_step", "max_rotation_step", "success_threshold",
             "start_distance", "start_height", "goal_translation", "max_stretch",

@@ -1,5 +1,6 @@
 """The shape-control environment."""
 
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,9 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from dlo_gym.envs import tasks
 from dlo_gym.envs.actions import ClampAction
-from dlo_gym.envs.cell import SimulatedCell, sample_occluder_paths
+from dlo_gym.envs.cell import Appearance, SimulatedCell, sample_occluder_paths
 from dlo_gym.envs.config import ShapeEnvConfig
 from dlo_gym.envs.observers import make_observer
+from dlo_gym.envs.randomization import believed_cameras, randomized_properties
 from dlo_gym.exceptions import TrackLost
 from dlo_gym.geometry.curves import arc_length
 from dlo_gym.geometry.se3 import Array
@@ -77,6 +79,7 @@ class ShapeControlEnv(gym.Env):
     | `wrench_left`, `wrench_right` | (6,) force [N] and torque [N m] of each clamp on the rod, |
     |                               | world axes                                                |
     | `displacement`                | (12,) how the clamps really moved [m, rad], world axes    |
+    | `randomization`               | at reset, with `randomization` only: what was sampled     |
     | `termination`                 | why the episode ended early, or `""`                      |
 
     ## Starting State
@@ -130,6 +133,7 @@ class ShapeControlEnv(gym.Env):
         self._observer = make_observer(config.observer, config.observer_options)
         self._estimate: ShapeEstimate | None = None
         self._goal: Array | None = None
+        self._commands: deque[BoundaryDisplacement] = deque()
         self.clamp_action = ClampAction(
             config.max_translation_step, config.max_rotation_step, config.axial_rotation
         )
@@ -162,11 +166,12 @@ class ShapeControlEnv(gym.Env):
                 f" valid options are: {', '.join(RESET_OPTIONS)}"
             )
         config, rng = self.config, self.np_random
+        randomized = self._randomize() if config.randomization is not None else None
         start, goal = options.get("start"), options.get("goal")
         if start is not None and (not isinstance(start, BoundaryPoses) or start.right is None):
             raise ValueError(f"start: expected BoundaryPoses of two clamps, got {start!r}")
         if goal is not None:
-            goal = check_goal(goal, config)
+            goal = check_goal(goal, config, self.cell.properties.length)
         occluders = sample_occluder_paths(rng, self.cell.cameras, config.n_occluders)
         if start is not None:
             self.cell.reset(start, occluders)
@@ -176,14 +181,17 @@ class ShapeControlEnv(gym.Env):
             goal = tasks.sample_goal(self.cell, rng, config).centerline
         self._goal = goal
         self._estimate = self._observer.reset(self.cell)
-        return self._observation(), self._info(BoundaryDisplacement.zero(), "")
+        info = self._info(BoundaryDisplacement.zero(), "")
+        if randomized is not None:
+            info["randomization"] = randomized
+        return self._observation(), info
 
     def step(
         self, action: ArrayLike
     ) -> tuple[dict[str, NDArray], float, bool, bool, dict[str, Any]]:
         if self._estimate is None:
             raise gym.error.ResetNeeded("call reset() before step()")
-        displacement = self.action_to_displacement(action)
+        displacement = self.delayed(self.action_to_displacement(action))
         before = self.cell.boundary
         termination = tasks.advance(self.cell, displacement, self.config)
         if self.cell.boundary is before:  # refused
@@ -196,6 +204,11 @@ class ShapeControlEnv(gym.Env):
             observation["achieved_goal"], observation["desired_goal"], info
         )
         return observation, float(reward), bool(termination), False, info
+
+    def delayed(self, displacement: BoundaryDisplacement) -> BoundaryDisplacement:
+        """The motion that the arms make now that ``displacement`` is asked of them."""
+        self._commands.append(displacement)
+        return self._commands.popleft()
 
     def observe(self, displacement: BoundaryDisplacement) -> bool:
         """Look at the cell after its clamps have moved; False if the rod is lost from sight."""
@@ -257,6 +270,22 @@ class ShapeControlEnv(gym.Env):
         self._observer.close()
         self.cell.close()
 
+    def _randomize(self) -> dict[str, Any]:
+        """Sample what ``randomization`` has ranges of, and set the cell up so."""
+        assert self.config.randomization is not None
+        values = self.config.randomization.sample(self.np_random, self.cell.cameras)
+        self.cell.replace_rod(
+            randomized_properties(self.config.properties, values),
+            Appearance(
+                values.get("rod_color"),
+                believed_cameras(self.cell.cameras, values),
+                values.get("camera_latency", 0),
+            ),
+        )
+        still = [BoundaryDisplacement.zero()] * values.get("arm_latency", 0)
+        self._commands = deque(still)
+        return values
+
     def _make_observation_space(self) -> spaces.Dict:
         n_nodes = self.config.n_nodes
         # No point of a cable in reach of the arms is further than 2 m from the origin.
@@ -316,8 +345,9 @@ def flat_observation(centerlines: Array, clamps: Array, goals: Array) -> dict[st
     }
 
 
-def check_goal(goal: ArrayLike, config: ShapeEnvConfig) -> Array:
-    """``goal`` as a centerline (n_nodes, 3) that the rod of ``config`` can take.
+def check_goal(goal: ArrayLike, config: ShapeEnvConfig, length: float | None = None) -> Array:
+    """``goal`` as a centerline (n_nodes, 3) that the rod of ``config`` can take, or one of another
+    ``length`` [m].
 
     Raises:
         ValueError: on a wrong shape, a value that is not finite, or an overstretched goal.
@@ -328,7 +358,7 @@ def check_goal(goal: ArrayLike, config: ShapeEnvConfig) -> Array:
             f"goal: expected a finite centerline of shape ({config.n_nodes}, 3),"
             f" got shape {goal.shape}"
         )
-    length = config.properties.length
+    length = config.properties.length if length is None else length
     span, along = float(np.linalg.norm(goal[-1] - goal[0])), float(arc_length(goal)[-1])
     if span > config.max_stretch * length or along > LONGEST_GOAL * length:
         raise ValueError(

@@ -187,7 +187,7 @@ def sample_goal(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvC
                 continue
             goal = Goal(cell.rod_state.positions.copy(), cell.boundary)
             distance = shape_error(goal.centerline, start.rod.positions)
-            stretch = goal.boundary.distance / (config.max_stretch * config.properties.length)
+            stretch = goal.boundary.distance / (config.max_stretch * cell.properties.length)
             near, far = config.goal_distance
             if near <= distance <= far and stretch <= GOAL_STRETCH:
                 return goal
@@ -237,7 +237,10 @@ def _detour(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvConfi
     for _ in range(DETOURS):
         around = _random_motion(boundary, boundary, rng, config).vector.reshape(2, 6)
         around[:, 3:] = 0.0
-        legs = [BoundaryDisplacement(*around), BoundaryDisplacement(*(motion.vector.reshape(2, 6) - around))]
+        legs = [
+            BoundaryDisplacement(*around),
+            BoundaryDisplacement(*(motion.vector.reshape(2, 6) - around)),
+        ]
         cell.restore(start)
         if all(_follow(cell, leg, config) for leg in legs):
             return True

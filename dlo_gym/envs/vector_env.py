@@ -214,6 +214,10 @@ def _advance(envs: Sequence[ShapeControlEnv], actions: Array) -> tuple[Array, li
     clamps = np.stack([cell.boundary.clamps for cell in cells])
     before = [cell.boundary for cell in cells]
     twists = envs[0].clamp_action.to_twists(actions, clamps)
+    if envs[0].config.randomization is not None:
+        asked = (BoundaryDisplacement(*twist) for twist in twists)
+        now = [env.delayed(twist) for env, twist in zip(envs, asked, strict=True)]
+        twists = np.stack([twist.vector for twist in now]).reshape(twists.shape)
     reasons = tasks.advance_all(cells, twists, envs[0].config)
     for env, twist, boundary in zip(envs, twists, before, strict=True):
         if env.cell.boundary is boundary:  # refused

@@ -47,6 +47,7 @@ class SceneRenderer:
         moving = np.concatenate([self._rod, self._occluders])
         fixed = np.setdiff1d(np.flatnonzero(self.model.geom_bodyid == 0), moving)
         self.model.geom_group[fixed] = _SCENERY
+        self.rod_radius = self.config.rod_radius
         self._positions: Array | None = None
         self._canvas: _Canvas | None = None
 
@@ -110,6 +111,13 @@ class SceneRenderer:
         self._pose_rod(positions)
         self._pose_occluders(occluders)
 
+    def dress_rod(self, radius: float, color: ArrayLike | None = None) -> None:
+        """Draw the rod with another ``radius`` [m] and RGB in [0, 1], the config's where None."""
+        self.rod_radius = radius
+        self.model.geom_size[self._rod, 0] = radius
+        rgb = self.config.rod_color if color is None else color
+        self.model.mat_rgba[self.model.material("rod").id, :3] = rgb
+
     def _pose_rod(self, positions: Array) -> None:
         # Written over mj_kinematics' result: fifty bodies that never interact need no joints.
         axes = np.diff(positions, axis=0)
@@ -121,7 +129,7 @@ class SceneRenderer:
         self.data.geom_xpos[self._rod] = (positions[1:] + positions[:-1]) / 2
         self.data.geom_xmat[self._rod] = frames.reshape(-1, 9)
         self.model.geom_size[self._rod, 1] = lengths[:, 0] / 2
-        self.model.geom_rbound[self._rod] = lengths[:, 0] / 2 + self.config.rod_radius
+        self.model.geom_rbound[self._rod] = lengths[:, 0] / 2 + self.rod_radius
         self._positions = positions
 
     def _pose_occluders(self, occluders: Array) -> None:
@@ -165,7 +173,7 @@ class SceneRenderer:
         """
         camera = self._lens(camera_name).camera
         positions = self._require_positions()
-        facing = _facing_points(positions, camera.centre, self.config.rod_radius)
+        facing = _facing_points(positions, camera.centre, self.rod_radius)
         rays = facing - camera.centre
         distances = np.linalg.norm(rays, axis=1)
         rays /= distances[:, None]
@@ -173,7 +181,7 @@ class SceneRenderer:
         geom = np.zeros(1, dtype=np.int32)
         for i in np.flatnonzero(visible):
             hit = mujoco.mj_ray(self.model, self.data, camera.centre, rays[i], None, True, -1, geom)
-            visible[i] = hit < 0 or hit >= distances[i] - self.config.rod_radius
+            visible[i] = hit < 0 or hit >= distances[i] - self.rod_radius
         return visible
 
     def arms_in_collision(self) -> bool:
