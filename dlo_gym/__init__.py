@@ -15,6 +15,13 @@ SHAPE_TASKS = {
         "goal_rotation": radians(60.0),
         "straight_way": "blocked",
     },
+    "Planar": {"planar": True},
+    "OneArm": {
+        "free_end": True,
+        "start_height": 0.62,
+        "goal_distance": (0.06, 0.35),
+        "workspace": ((-0.4, -0.25, 0.56), (0.1, 0.25, 0.75)),
+    },
 }
 
 for name, task in SHAPE_TASKS.items():

@@ -34,6 +34,9 @@ class ShapeEnvConfig:
         max_translation_step: largest motion of a clamp along each world axis in one step [m].
         max_rotation_step: largest rotation of a clamp about each of its axes in one step [rad].
         axial_rotation: whether the action also turns the clamps about the rod's own axis.
+        planar: whether both clamps stay in the vertical plane through the arms' tools, and with
+            them, unless it buckles, the rod: two translations and a rotation each.
+        free_end: whether the left arm alone holds the rod.
         randomization: what every reset samples anew; None for nothing.
         reward: ``"dense"`` or ``"sparse"``.
         success_threshold: mean node error that counts as success [m].
@@ -70,6 +73,8 @@ class ShapeEnvConfig:
     max_translation_step: float = 0.01
     max_rotation_step: float = float(np.deg2rad(4.5))
     axial_rotation: bool = False
+    planar: bool = False
+    free_end: bool = False
     randomization: Randomization | None = None
     reward: Literal["dense", "sparse"] = "dense"
     success_threshold: float = 0.005
@@ -132,6 +137,10 @@ class ShapeEnvConfig:
                 "goal_distance: expected a smallest below a largest distance [m],"
                 f" got {self.goal_distance}"
             )
+        if self.planar and self.axial_rotation:
+            raise ValueError("axial_rotation: expected False with planar, got True")
+        if self.straight_way == "blocked" and self.free_end:
+            raise ValueError('straight_way: "blocked" needs both arms, expected free_end=False')
         if self.straight_way == "blocked" and not self.check_arms:
             raise ValueError('straight_way: "blocked" is about the arms, expected check_arms=True')
         if self.max_stretch >= 1.0:
@@ -168,6 +177,10 @@ class ShapeEnvConfig:
     @property
     def n_nodes(self) -> int:
         return self.n_elements + 1
+
+    @property
+    def n_clamps(self) -> int:
+        return 1 if self.free_end else 2
 
     @property
     def uses_images(self) -> bool:

@@ -36,7 +36,10 @@ class ShapeControlEnv(gym.Env):
     equilibrium between two clamps. Both arms move their clamp a little in every step; the whole
     centerline shall come to lie on the goal's. `dlo_gym/ShapeControl-v0` observes the simulator's
     own state, `dlo_gym/ShapeControlTracked-v0` renders two views in every step and observes the
-    cable through the multi-view tracker.
+    cable through the multi-view tracker, `dlo_gym/ShapeControlImages-v0` adds the views to the
+    observation. So do the tasks `ShapeControlEasy`, `Medium` and `Hard` (the arms would collide on
+    the straight way to the goal), `Planar` (in the vertical plane) and `OneArm` (the right end
+    free), e.g. `dlo_gym/ShapeControlHardTracked-v0`; `docs/environments.md` compares them.
 
     ## Action Space
     A `Box(-1, 1, (10,), float32)`, or `(12,)` with `axial_rotation=True`. Larger values are
@@ -50,6 +53,8 @@ class ShapeControlEnv(gym.Env):
     | 8-9 | right clamp: rotation about its d1, d2   | as left                        |
 
     With `axial_rotation` each clamp has one more number, the rotation about d3 (the cable's axis).
+    `planar=True` leaves translation along x and z and rotation about d1; `free_end=True` leaves
+    the left clamp.
 
     ## Observation Space
     A flat `Dict` of float32 arrays, with n = 51 nodes:
@@ -57,7 +62,8 @@ class ShapeControlEnv(gym.Env):
     | Key              | Shape       | Meaning                                                   |
     | ---------------- | ----------- | --------------------------------------------------------- |
     | `observation`    | (3 n + 18,) | estimated centerline [m]; then of the left and the right  |
-    |                  |             | clamp the position [m], d1 and d3                         |
+    |                  |             | clamp the position [m], d1 and d3 (zeros where the right  |
+    |                  |             | end is free)                                              |
     | `achieved_goal`  | (3 n,)      | estimated centerline, world [m], node 0 at the left clamp |
     | `desired_goal`   | (3 n,)      | goal centerline, world [m]                                |
     | `image_<camera>` | (h, w, 3)   | uint8 RGB; only with `observation_mode="images"`          |
@@ -135,7 +141,11 @@ class ShapeControlEnv(gym.Env):
         self._goal: Array | None = None
         self._commands: deque[BoundaryDisplacement] = deque()
         self.clamp_action = ClampAction(
-            config.max_translation_step, config.max_rotation_step, config.axial_rotation
+            config.max_translation_step,
+            config.max_rotation_step,
+            config.axial_rotation,
+            config.planar,
+            config.n_clamps,
         )
         self.action_space = spaces.Box(-1.0, 1.0, (self.clamp_action.size,), np.float32)
         self.observation_space = self._make_observation_space()
@@ -168,8 +178,11 @@ class ShapeControlEnv(gym.Env):
         config, rng = self.config, self.np_random
         randomized = self._randomize() if config.randomization is not None else None
         start, goal = options.get("start"), options.get("goal")
-        if start is not None and (not isinstance(start, BoundaryPoses) or start.right is None):
-            raise ValueError(f"start: expected BoundaryPoses of two clamps, got {start!r}")
+        if start is not None and (
+            not isinstance(start, BoundaryPoses) or len(start.clamps) != config.n_clamps
+        ):
+            held = "one clamp" if config.free_end else "two clamps"
+            raise ValueError(f"start: expected BoundaryPoses of {held}, got {start!r}")
         if goal is not None:
             goal = check_goal(goal, config, self.cell.properties.length)
         occluders = sample_occluder_paths(rng, self.cell.cameras, config.n_occluders)
@@ -181,7 +194,7 @@ class ShapeControlEnv(gym.Env):
             goal = tasks.sample_goal(self.cell, rng, config).centerline
         self._goal = goal
         self._estimate = self._observer.reset(self.cell)
-        info = self._info(BoundaryDisplacement.zero(), "")
+        info = self._info(BoundaryDisplacement.zero(self.config.n_clamps), "")
         if randomized is not None:
             info["randomization"] = randomized
         return self._observation(), info
@@ -195,7 +208,7 @@ class ShapeControlEnv(gym.Env):
         before = self.cell.boundary
         termination = tasks.advance(self.cell, displacement, self.config)
         if self.cell.boundary is before:  # refused
-            displacement = BoundaryDisplacement.zero()
+            displacement = BoundaryDisplacement.zero(self.config.n_clamps)
         if not self.observe(displacement):
             termination = termination or "track_lost"
         observation = self._observation()
@@ -282,7 +295,7 @@ class ShapeControlEnv(gym.Env):
                 values.get("camera_latency", 0),
             ),
         )
-        still = [BoundaryDisplacement.zero()] * values.get("arm_latency", 0)
+        still = [BoundaryDisplacement.zero(self.config.n_clamps)] * values.get("arm_latency", 0)
         self._commands = deque(still)
         return values
 
@@ -320,7 +333,7 @@ class ShapeControlEnv(gym.Env):
             "occlusion_ratio": hidden,
             "wrench_left": state.wrench_left.copy(),
             "wrench_right": state.wrench_right.copy(),
-            "displacement": displacement.vector,
+            "displacement": two_clamps(displacement.vector),
             "termination": termination,
         }
 
@@ -332,12 +345,21 @@ def shape_observation(
     return flat_observation(centerline, boundary.clamps, goal)
 
 
+def two_clamps(vectors: Array) -> Array:
+    """Motions (..., 12) of both clamps, of (..., 12) or those of the left one alone (..., 6)."""
+    both = np.zeros((*vectors.shape[:-1], 12))
+    both[..., : vectors.shape[-1]] = vectors
+    return both
+
+
 def flat_observation(centerlines: Array, clamps: Array, goals: Array) -> dict[str, NDArray]:
     """Observations of centerlines (..., n, 3) [m] held at clamps (..., k, 4, 4), for goals
     (..., n, 3) [m]."""
     batch = centerlines.shape[:-2]
     points = centerlines.reshape(*batch, -1)
-    held = clamps[..., :3, [3, 0, 2]].swapaxes(-1, -2).reshape(*batch, -1)
+    held = np.zeros((*batch, 18))  # of a free right end nothing
+    numbers = clamps[..., :3, [3, 0, 2]].swapaxes(-1, -2).reshape(*batch, -1)
+    held[..., : numbers.shape[-1]] = numbers
     return {
         "observation": np.concatenate([points, held], axis=-1).astype(np.float32),
         "achieved_goal": points.astype(np.float32),
@@ -360,7 +382,9 @@ def check_goal(goal: ArrayLike, config: ShapeEnvConfig, length: float | None = N
         )
     length = config.properties.length if length is None else length
     span, along = float(np.linalg.norm(goal[-1] - goal[0])), float(arc_length(goal)[-1])
-    if span > config.max_stretch * length or along > LONGEST_GOAL * length:
+    if (
+        span > config.max_stretch * length and not config.free_end
+    ) or along > LONGEST_GOAL * length:
         raise ValueError(
             f"goal: overstretched: its ends are {span:.4f} m apart and it is {along:.4f} m long,"
             f" for a rod of {length:.4f} m with max_stretch {config.max_stretch}"

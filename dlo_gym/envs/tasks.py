@@ -98,7 +98,7 @@ def advance_all(cells: Sequence[SimulatedCell], twists: Array, config: ShapeEnvC
     arms = cells[0].arms
     if arms is not None:
         guesses = np.stack([_joint_angles(cell) for cell in cells])
-        joint_angles = arms.reach(displace(clamps, twists), guesses)
+        joint_angles = list(arms.reach(displace(clamps, twists), guesses))
     for i, (cell, twist, angles) in enumerate(zip(cells, twists, joint_angles, strict=True)):
         reasons[i] = reasons[i] or _move(cell, twist, angles)
     moved = [i for i, reason in enumerate(reasons) if not reason]
@@ -161,7 +161,7 @@ def reset_to_random_start(
             cell.reset(_random_start(rng, config), occluders)
         except (UnreachablePose, RodDiverged, ValueError):
             continue
-        if advance(cell, BoundaryDisplacement.zero(), config) == "":
+        if advance(cell, BoundaryDisplacement.zero(config.n_clamps), config) == "":
             cell.reset(cell.boundary, occluders)
             return
     raise ValueError(
@@ -207,8 +207,10 @@ def _random_start(rng: np.random.Generator, config: ShapeEnvConfig) -> BoundaryP
         position = np.array([side * config.start_distance, 0.0, config.start_height])
         position += rng.uniform(-1.0, 1.0, 3) * config.start_noise[0]
         tilt = np.append(rng.uniform(-1.0, 1.0, 2) * config.start_noise[1], 0.0)
+        if config.planar:
+            position[1] = tilt[1] = 0.0
         clamps.append(pose(along_x @ exp_so3(tilt), position))
-    return BoundaryPoses(*clamps)
+    return BoundaryPoses(*clamps[: config.n_clamps])
 
 
 def _wander(
@@ -254,7 +256,7 @@ def straight_way_blocked(cell: SimulatedCell, goal: BoundaryPoses, config: Shape
     if cell.arms is None or guess is None:
         return False
     motion = cell.boundary.displacement_to(goal)
-    n_steps = _n_steps(motion, config)
+    n_steps = _n_steps(motion, cell.boundary, config)
     shares = np.arange(1, n_steps + 1)[:, None, None] / n_steps
     starts = np.repeat(cell.boundary.clamps[None], n_steps, axis=0)
     clamps = displace(starts, shares * motion.vector.reshape(-1, 6))
@@ -278,9 +280,12 @@ def _random_motion(
     low, high = np.asarray(config.workspace)
     together = rng.uniform(-1.0, 1.0, 3)
     apart = rng.uniform(-0.5, 0.5, (2, 3))
-    offsets = config.goal_translation * (together + apart)
+    offsets = config.goal_translation * (together + apart)[: config.n_clamps]
     targets = np.clip(start.clamps[:, :3, 3] + offsets, low, high)
-    rotations = rng.uniform(-1.0, 1.0, (2, 2)) * config.goal_rotation
+    rotations = (rng.uniform(-1.0, 1.0, (2, 2)) * config.goal_rotation)[: config.n_clamps]
+    if config.planar:
+        targets[:, 1] = boundary.clamps[:, 1, 3]
+        rotations[:, 1] = 0.0
     twists = [
         np.concatenate([target - clamp[:3, 3], clamp[:3, :2] @ rotation])
         for clamp, target, rotation in zip(boundary.clamps, targets, rotations, strict=True)
@@ -288,16 +293,18 @@ def _random_motion(
     return BoundaryDisplacement(*twists)
 
 
-def _n_steps(motion: BoundaryDisplacement, config: ShapeEnvConfig) -> int:
-    """How many steps a motion takes within the limits."""
-    twists = np.abs(motion.vector.reshape(-1, 6))
+def _n_steps(motion: BoundaryDisplacement, boundary: BoundaryPoses, config: ShapeEnvConfig) -> int:
+    """How many steps a motion from ``boundary`` takes within the limits."""
+    twists = motion.vector.reshape(-1, 6)
+    turns = boundary.clamps[:, :3, :3].swapaxes(-1, -2) @ twists[:, 3:, None]
     largest = max(
-        twists[:, :3].max() / config.max_translation_step,
-        twists[:, 3:].max() / config.max_rotation_step,
+        np.abs(twists[:, :3]).max() / config.max_translation_step,
+        np.abs(turns).max() / config.max_rotation_step,
     )
     return max(1, int(np.ceil(largest)))
 
 
 def _follow(cell: SimulatedCell, motion: BoundaryDisplacement, config: ShapeEnvConfig) -> bool:
-    step = motion.scaled(1.0 / _n_steps(motion, config))
-    return not any(advance(cell, step, config) for _ in range(_n_steps(motion, config)))
+    n_steps = _n_steps(motion, cell.boundary, config)
+    step = motion.scaled(1.0 / n_steps)
+    return not any(advance(cell, step, config) for _ in range(n_steps))

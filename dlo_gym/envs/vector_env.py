@@ -10,7 +10,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from dlo_gym.envs import tasks
-from dlo_gym.envs.shape_env import ShapeControlEnv, flat_observation
+from dlo_gym.envs.shape_env import ShapeControlEnv, flat_observation, two_clamps
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryDisplacement
 
@@ -91,9 +91,9 @@ class ShapeControlVectorEnv(VectorEnv):
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode where ``mask`` (n,) says so, each with a seed and options of its own."""
         infos: dict[str, Any] = {}
-        for i in np.flatnonzero(mask):
+        for i in np.flatnonzero(mask).tolist():
             _, info = self.envs[i].reset(seed=seeds[i], options=options[i])
-            infos = self._add_info(infos, info, int(i))
+            infos = self._add_info(infos, info, i)
         if self._over is None:
             self._over = np.zeros(self.num_envs, dtype=bool)
         self._steps[mask], self._over[mask] = 0, False
@@ -114,7 +114,7 @@ class ShapeControlVectorEnv(VectorEnv):
         going = np.flatnonzero(~starting)
         started = {int(i): self.envs[i].reset()[1] for i in np.flatnonzero(starting)}
         reasons = np.full(self.num_envs, "", dtype=object)
-        twists = np.zeros((self.num_envs, 2, 6))
+        twists = np.zeros((self.num_envs, self.config.n_clamps, 6))
         if len(going):
             moving = [self.envs[i] for i in going]
             twists[going], reasons[going] = _advance(moving, actions[going])
@@ -137,8 +137,8 @@ class ShapeControlVectorEnv(VectorEnv):
         rewards[starting] = 0.0
         for i, info in started.items():
             infos = self._add_info(infos, info, i)
-        self._over = terminations | truncations
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._over.any():
+        self._over = over = terminations | truncations
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and over.any():
             observations, infos = self._start_over(observations, infos)
         return observations, rewards, terminations, truncations, infos
 
@@ -184,7 +184,7 @@ class ShapeControlVectorEnv(VectorEnv):
             "occlusion_ratio": np.zeros(self.num_envs),
             "wrench_left": np.stack([state.wrench_left for state in states]),
             "wrench_right": np.stack([state.wrench_right for state in states]),
-            "displacement": twists.reshape(self.num_envs, -1),
+            "displacement": two_clamps(twists.reshape(self.num_envs, -1)),
             "termination": reasons,
         }
         return infos | {f"_{key}": np.ones(self.num_envs, dtype=bool) for key in infos}
@@ -194,7 +194,7 @@ class ShapeControlVectorEnv(VectorEnv):
     ) -> tuple[Observations, dict[str, Any]]:
         """Begin the next episode where one has ended; what it ended with goes into ``infos``."""
         assert self._over is not None
-        over = np.flatnonzero(self._over)
+        over = np.flatnonzero(self._over).tolist()
         final: dict[str, Any] = {}
         for i in over:
             last = {key: values[i] for key, values in observations.items()}

@@ -94,8 +94,8 @@ class BoundaryDisplacement:
             object.__setattr__(self, side, value)
 
     @classmethod
-    def zero(cls) -> "BoundaryDisplacement":
-        return cls(np.zeros(6), np.zeros(6))
+    def zero(cls, n_clamps: int = 2) -> "BoundaryDisplacement":
+        return cls(*np.zeros((n_clamps, 6)))
 
     @classmethod
     def from_vector(cls, vector: ArrayLike) -> "BoundaryDisplacement":

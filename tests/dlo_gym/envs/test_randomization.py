@@ -55,7 +55,7 @@ def test_every_reset_has_another_rod_and_says_so(env):
     for seed in range(3):
         _, info = env.reset(seed=seed)
         said, cell = info["randomization"], env.unwrapped.cell
-        assert said.keys() == {name for name in EVERYTHING.__dataclass_fields__}
+        assert said.keys() == set(EVERYTHING.__dataclass_fields__)
         for name in ("youngs_modulus", "radius", "length", "density"):
             assert getattr(cell.properties, name) == said[name]
         np.testing.assert_array_equal(cell.properties.rest_curvature, said["rest_curvature"])
