@@ -12,31 +12,41 @@ from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 @dataclass(frozen=True)
 class ClampAction:
     """Per clamp, left then right: translation along world x y z, rotation about its own d1 and d2,
-    and about d3 if ``axial_rotation``, each in fractions of the step limit.
+    and about d3 if ``axial_rotation``, each in fractions of the step limit. In the vertical plane
+    (``planar``): translation along x z, rotation about d1.
 
     Attributes:
         max_translation_step: [m].
         max_rotation_step: [rad].
         axial_rotation: whether the clamps also turn about the rod's own axis.
+        planar: whether the clamps stay in the plane of world x and z.
+        n_clamps: 2, or 1 where the right end is free.
     """
 
     max_translation_step: float
     max_rotation_step: float
     axial_rotation: bool = False
+    planar: bool = False
+    n_clamps: int = 2
+
+    @property
+    def translation_axes(self) -> list[int]:
+        return [0, 2] if self.planar else [0, 1, 2]
 
     @property
     def n_rotations(self) -> int:
-        return 3 if self.axial_rotation else 2
+        return 1 if self.planar else (3 if self.axial_rotation else 2)
 
     @property
     def size(self) -> int:
-        return 2 * (3 + self.n_rotations)
+        return self.n_clamps * (len(self.translation_axes) + self.n_rotations)
 
     @property
     def scale(self) -> Array:
         """(size,) what 1 stands for in each component [m], [rad]."""
-        one = [self.max_translation_step] * 3 + [self.max_rotation_step] * self.n_rotations
-        return np.array(one + one)
+        one = [self.max_translation_step] * len(self.translation_axes)
+        one += [self.max_rotation_step] * self.n_rotations
+        return np.array(one * self.n_clamps)
 
     def to_displacement(self, action: ArrayLike, boundary: BoundaryPoses) -> BoundaryDisplacement:
         """The motion from ``boundary`` that ``action`` (size,) stands for; clipped to [-1, 1].
@@ -49,32 +59,37 @@ class ClampAction:
             raise ValueError(
                 f"action: expected {self.size} numbers in [-1, 1] without NaN, got {action}"
             )
-        parts = (np.clip(action, -1.0, 1.0) * self.scale).reshape(2, -1)
-        twists = [
-            np.concatenate([part[:3], clamp[:3, : self.n_rotations] @ part[3:]])
-            for part, clamp in zip(parts, _clamps(boundary), strict=True)
-        ]
-        return BoundaryDisplacement(*twists)
+        return BoundaryDisplacement(*self.to_twists(action, self._clamps(boundary)))
+
+    def to_twists(self, actions: Array, clamps: Array) -> Array:
+        """Twists (..., k, 6) [m], [rad], world axes, that ``actions`` (..., size) stand for at
+        clamp poses (..., k, 4, 4); unchecked, clipped to [-1, 1]."""
+        axes = self.translation_axes
+        parts = np.clip(actions, -1.0, 1.0) * self.scale
+        parts = parts.reshape(*actions.shape[:-1], self.n_clamps, -1)
+        twists = np.zeros((*parts.shape[:-1], 6))
+        twists[..., axes] = parts[..., : len(axes)]
+        turning = clamps[..., :3, : self.n_rotations]
+        twists[..., 3:] = (turning @ parts[..., len(axes) :, None])[..., 0]
+        return twists
 
     def to_action(self, displacement: BoundaryDisplacement, boundary: BoundaryPoses) -> Array:
         """The action (size,) closest to ``displacement``: cut to the limits component by component,
         without what the action does not move."""
-        parts = [
-            np.concatenate([twist[:3], clamp[:3, : self.n_rotations].T @ twist[3:]])
-            for twist, clamp in zip(
-                displacement.vector.reshape(2, 6), _clamps(boundary), strict=True
-            )
-        ]
-        return np.clip(np.concatenate(parts) / self.scale, -1.0, 1.0)
+        twists = displacement.vector.reshape(-1, 6)
+        turning = self._clamps(boundary)[:, :3, : self.n_rotations].swapaxes(-1, -2)
+        turns = (turning @ twists[:, 3:, None])[..., 0]
+        parts = np.concatenate([twists[:, self.translation_axes], turns], axis=-1)
+        return np.clip(parts.ravel() / self.scale, -1.0, 1.0)
+
+    def _clamps(self, boundary: BoundaryPoses) -> Array:
+        if len(boundary.clamps) != self.n_clamps:
+            held = "two clamps" if self.n_clamps == 2 else "one clamp"
+            raise ValueError(f"boundary: expected {held}, got {len(boundary.clamps)}")
+        return boundary.clamps
 
 
 def clamp_numbers(clamp: Array | None) -> Array:
     """(9,) position [m], d1 and d3 of a clamp pose, as observations carry it."""
     assert clamp is not None
     return np.concatenate([clamp[:3, 3], clamp[:3, 0], clamp[:3, 2]])
-
-
-def _clamps(boundary: BoundaryPoses) -> tuple[Array, Array]:
-    if boundary.right is None:
-        raise ValueError("boundary: expected two clamps, got a free right end")
-    return boundary.left, boundary.right

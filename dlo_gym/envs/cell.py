@@ -1,5 +1,6 @@
 """The simulated work cell: a rod between two arms, cameras, moving occluders and a clock."""
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -35,6 +36,21 @@ class OccluderPath:
     def position(self, stamp: float) -> Array:
         """(3,) where the body is at time ``stamp`` [s]."""
         return self.centre + self.swing * np.sin(2.0 * np.pi * stamp / self.period + self.phase)
+
+
+@dataclass(frozen=True, eq=False)
+class Appearance:
+    """How this cell differs from what its scene says.
+
+    Attributes:
+        rod_color: RGB in [0, 1]; the scene's where None.
+        cameras: the scene's, as who looks at the images knows them; exactly where None.
+        camera_latency: how many control steps old the images are.
+    """
+
+    rod_color: Array | None = None
+    cameras: tuple[CameraModel, ...] | None = None
+    camera_latency: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +97,14 @@ class SimulatedCell:
         self._posed = False
         self._views: tuple[View, ...] | None = None
         self._visibility: NDArray[np.bool_] | None = None
+        self._appearance = Appearance()
+        self._past: deque[CellState] = deque(maxlen=1)
+
+    def replace_rod(self, properties: RodProperties, appearance: Appearance) -> None:
+        """Another rod of as many elements, looked at in another way, from the next reset on."""
+        self.rod = CosseratRod(properties, self.rod.n_elements)
+        self._appearance = appearance
+        self._past = deque(maxlen=1 + appearance.camera_latency)
 
     @property
     def properties(self) -> RodProperties:
@@ -124,20 +148,28 @@ class SimulatedCell:
         self._rod_state = self.rod.settle(boundary)
         self.joint_angles = joint_angles
         self._occluders = tuple(occluders)
+        self._past.clear()
         self._show(0.0)
         return self._rod_state
 
-    def move(self, displacement: BoundaryDisplacement) -> RodState:
+    def move(
+        self, displacement: BoundaryDisplacement, joint_angles: Array | None = None
+    ) -> RodState:
         """Move the clamps, let the rod follow and the clock go on.
 
         Nothing has changed if this raises.
+
+        Args:
+            displacement: of the clamps.
+            joint_angles: (2, 6) [rad] that hold the moved clamps, where they are known already.
 
         Raises:
             ValueError: if the clamps would be further apart than the rod is long.
             UnreachablePose: if an arm cannot follow.
             RodDiverged: if the rod's equilibrium was lost.
         """
-        joint_angles = self._reach(self.boundary.displaced(displacement), self.joint_angles)
+        if joint_angles is None:
+            joint_angles = self._reach(self.boundary.displaced(displacement), self.joint_angles)
         self._rod_state = self.rod.move(displacement)
         self.joint_angles = joint_angles
         self._show(self.stamp + self.control_step)
@@ -151,6 +183,7 @@ class SimulatedCell:
         self.rod.restore(state.rod)
         self._rod_state = state.rod
         self.joint_angles = state.joint_angles
+        self._past.clear()
         self._show(state.stamp)
 
     def arms_in_collision(self) -> bool:
@@ -160,9 +193,14 @@ class SimulatedCell:
         return self.arms.clearance(self.joint_angles).minimum < 0.0
 
     def views(self) -> tuple[View, ...]:
-        """One image per camera of the cell as it is now."""
+        """One image per camera of the cell as it is now, or was ``camera_latency`` steps ago."""
         if self._views is None:
-            self._views = self._posed_renderer().views(self.stamp)
+            views = self._posed_renderer().views(self._past[0].stamp)
+            known = self._appearance.cameras or self.cameras
+            self._views = tuple(
+                View(view.image, camera, view.stamp)
+                for view, camera in zip(views, known, strict=True)
+            )
         return self._views
 
     def visibility(self) -> NDArray[np.bool_]:
@@ -188,18 +226,22 @@ class SimulatedCell:
         self.stamp = stamp
         self._posed = False
         self._views = self._visibility = None
+        self._past.append(CellState(self.rod_state, self.joint_angles, stamp))
 
     def _posed_renderer(self) -> SceneRenderer:
         if self._renderer is None:
             self._renderer = SceneRenderer(self.scene)
         if not self._posed:
-            state = self.rod_state
-            occluders = np.array([path.position(self.stamp) for path in self._occluders])
+            seen = self._past[0]
+            occluders = np.array([path.position(seen.stamp) for path in self._occluders])
+            self._renderer.dress_rod(
+                float(np.max(self.properties.radius)), self._appearance.rod_color
+            )
             self._renderer.update(
-                state.positions,
-                state.boundary,
+                seen.rod.positions,
+                seen.rod.boundary,
                 occluder_positions=occluders if len(occluders) else None,
-                joint_angles=self.joint_angles,
+                joint_angles=seen.joint_angles,
             )
             self._posed = True
         return self._renderer

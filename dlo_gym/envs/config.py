@@ -6,12 +6,14 @@ from typing import Any, Literal
 
 import numpy as np
 
+from dlo_gym.envs.randomization import Randomization
 from dlo_gym.geometry.camera import CameraModel
 from dlo_gym.rod.properties import RodProperties
 
 CHOICES = {
     "observation_mode": ("state", "images"),
     "reward": ("dense", "sparse"),
+    "straight_way": ("any", "blocked"),
     "clutter": ("none", "industrial"),
     "renderer": ("opengl", "raster"),
     "quality": ("fast", "high"),
@@ -33,6 +35,10 @@ class ShapeEnvConfig:
         max_translation_step: largest motion of a clamp along each world axis in one step [m].
         max_rotation_step: largest rotation of a clamp about each of its axes in one step [rad].
         axial_rotation: whether the action also turns the clamps about the rod's own axis.
+        planar: whether both clamps stay in the vertical plane through the arms' tools, and with
+            them, unless it buckles, the rod: two translations and a rotation each.
+        free_end: whether the left arm alone holds the rod.
+        randomization: what every reset samples anew; None for nothing.
         reward: ``"dense"`` or ``"sparse"``.
         success_threshold: mean node error that counts as success [m].
         termination_penalty: taken off the reward of the step that ends an episode early.
@@ -42,6 +48,8 @@ class ShapeEnvConfig:
         goal_translation: half-range of the clamps' positions over these motions [m].
         goal_rotation: largest rotation about each clamp axis in one of these motions [rad].
         goal_distance: smallest and largest mean node distance between start and goal [m].
+        straight_way: ``"blocked"`` takes only goals where arms or grippers would collide, or not
+            reach, if both clamps went straight there.
         max_stretch: largest distance between the clamps, in lengths of the rod.
         min_gripper_distance: smallest distance between the clamps [m].
         workspace: lowest and highest clamp position (2, 3), world [m].
@@ -67,6 +75,9 @@ class ShapeEnvConfig:
     max_translation_step: float = 0.01
     max_rotation_step: float = float(np.deg2rad(4.5))
     axial_rotation: bool = False
+    planar: bool = False
+    free_end: bool = False
+    randomization: Randomization | None = None
     reward: Literal["dense", "sparse"] = "dense"
     success_threshold: float = 0.005
     termination_penalty: float = 20.0
@@ -77,6 +88,7 @@ class ShapeEnvConfig:
     goal_translation: float = 0.12
     goal_rotation: float = float(np.deg2rad(30.0))
     goal_distance: tuple[float, float] = (0.06, 0.25)
+    straight_way: Literal["any", "blocked"] = "any"
     max_stretch: float = 0.98
     min_gripper_distance: float = 0.05
     workspace: tuple[tuple[float, float, float], tuple[float, float, float]] = (
@@ -107,6 +119,8 @@ class ShapeEnvConfig:
             )
         if not isinstance(self.properties, RodProperties):
             raise ValueError(f"properties: expected RodProperties, got {self.properties!r}")
+        if not isinstance(self.randomization, Randomization | None):
+            raise ValueError(f"randomization: expected Randomization, got {self.randomization!r}")
         for name in (
             "control_step", "max_translation_step", "max_rotation_step", "success_threshold",
             "start_distance", "start_height", "goal_translation", "max_stretch",
@@ -128,6 +142,12 @@ class ShapeEnvConfig:
                 "goal_distance: expected a smallest below a largest distance [m],"
                 f" got {self.goal_distance}"
             )
+        if self.planar and self.axial_rotation:
+            raise ValueError("axial_rotation: expected False with planar, got True")
+        if self.straight_way == "blocked" and self.free_end:
+            raise ValueError('straight_way: "blocked" needs both arms, expected free_end=False')
+        if self.straight_way == "blocked" and not self.check_arms:
+            raise ValueError('straight_way: "blocked" is about the arms, expected check_arms=True')
         if self.max_stretch >= 1.0:
             raise ValueError(f"max_stretch: expected a fraction below 1, got {self.max_stretch}")
         if not all(isinstance(camera, CameraModel) for camera in self.cameras):
@@ -162,6 +182,10 @@ class ShapeEnvConfig:
     @property
     def n_nodes(self) -> int:
         return self.n_elements + 1
+
+    @property
+    def n_clamps(self) -> int:
+        return 1 if self.free_end else 2
 
     @property
     def uses_images(self) -> bool:

@@ -1,5 +1,6 @@
 """The shape-control environment."""
 
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,10 +10,11 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from dlo_gym.envs import tasks
-from dlo_gym.envs.actions import ClampAction, clamp_numbers
-from dlo_gym.envs.cell import SimulatedCell, sample_occluder_paths
+from dlo_gym.envs.actions import ClampAction
+from dlo_gym.envs.cell import Appearance, SimulatedCell, sample_occluder_paths
 from dlo_gym.envs.config import ShapeEnvConfig
 from dlo_gym.envs.observers import make_observer
+from dlo_gym.envs.randomization import believed_cameras, randomized_properties
 from dlo_gym.exceptions import TrackLost
 from dlo_gym.geometry.curves import arc_length
 from dlo_gym.geometry.se3 import Array
@@ -34,7 +36,10 @@ class ShapeControlEnv(gym.Env):
     equilibrium between two clamps. Both arms move their clamp a little in every step; the whole
     centerline shall come to lie on the goal's. `dlo_gym/ShapeControl-v0` observes the simulator's
     own state, `dlo_gym/ShapeControlTracked-v0` renders two views in every step and observes the
-    cable through the multi-view tracker.
+    cable through the multi-view tracker, `dlo_gym/ShapeControlImages-v0` adds the views to the
+    observation. So do the tasks `ShapeControlEasy`, `Medium` and `Hard` (the arms would collide on
+    the straight way to the goal), `Planar` (in the vertical plane) and `OneArm` (the right end
+    free), e.g. `dlo_gym/ShapeControlHardTracked-v0`; `docs/environments.md` compares them.
 
     ## Action Space
     A `Box(-1, 1, (10,), float32)`, or `(12,)` with `axial_rotation=True`. Larger values are
@@ -48,6 +53,8 @@ class ShapeControlEnv(gym.Env):
     | 8-9 | right clamp: rotation about its d1, d2   | as left                        |
 
     With `axial_rotation` each clamp has one more number, the rotation about d3 (the cable's axis).
+    `planar=True` leaves translation along x and z and rotation about d1; `free_end=True` leaves
+    the left clamp.
 
     ## Observation Space
     A flat `Dict` of float32 arrays, with n = 51 nodes:
@@ -55,7 +62,8 @@ class ShapeControlEnv(gym.Env):
     | Key              | Shape       | Meaning                                                   |
     | ---------------- | ----------- | --------------------------------------------------------- |
     | `observation`    | (3 n + 18,) | estimated centerline [m]; then of the left and the right  |
-    |                  |             | clamp the position [m], d1 and d3                         |
+    |                  |             | clamp the position [m], d1 and d3 (zeros where the right  |
+    |                  |             | end is free)                                              |
     | `achieved_goal`  | (3 n,)      | estimated centerline, world [m], node 0 at the left clamp |
     | `desired_goal`   | (3 n,)      | goal centerline, world [m]                                |
     | `image_<camera>` | (h, w, 3)   | uint8 RGB; only with `observation_mode="images"`          |
@@ -77,6 +85,7 @@ class ShapeControlEnv(gym.Env):
     | `wrench_left`, `wrench_right` | (6,) force [N] and torque [N m] of each clamp on the rod, |
     |                               | world axes                                                |
     | `displacement`                | (12,) how the clamps really moved [m, rad], world axes    |
+    | `randomization`               | at reset, with `randomization` only: what was sampled     |
     | `termination`                 | why the episode ended early, or `""`                      |
 
     ## Starting State
@@ -130,8 +139,13 @@ class ShapeControlEnv(gym.Env):
         self._observer = make_observer(config.observer, config.observer_options)
         self._estimate: ShapeEstimate | None = None
         self._goal: Array | None = None
+        self._commands: deque[BoundaryDisplacement] = deque()
         self.clamp_action = ClampAction(
-            config.max_translation_step, config.max_rotation_step, config.axial_rotation
+            config.max_translation_step,
+            config.max_rotation_step,
+            config.axial_rotation,
+            config.planar,
+            config.n_clamps,
         )
         self.action_space = spaces.Box(-1.0, 1.0, (self.clamp_action.size,), np.float32)
         self.observation_space = self._make_observation_space()
@@ -162,11 +176,15 @@ class ShapeControlEnv(gym.Env):
                 f" valid options are: {', '.join(RESET_OPTIONS)}"
             )
         config, rng = self.config, self.np_random
+        randomized = self._randomize() if config.randomization is not None else None
         start, goal = options.get("start"), options.get("goal")
-        if start is not None and (not isinstance(start, BoundaryPoses) or start.right is None):
-            raise ValueError(f"start: expected BoundaryPoses of two clamps, got {start!r}")
+        if start is not None and (
+            not isinstance(start, BoundaryPoses) or len(start.clamps) != config.n_clamps
+        ):
+            held = "one clamp" if config.free_end else "two clamps"
+            raise ValueError(f"start: expected BoundaryPoses of {held}, got {start!r}")
         if goal is not None:
-            goal = check_goal(goal, config)
+            goal = check_goal(goal, config, self.cell.properties.length)
         occluders = sample_occluder_paths(rng, self.cell.cameras, config.n_occluders)
         if start is not None:
             self.cell.reset(start, occluders)
@@ -176,21 +194,22 @@ class ShapeControlEnv(gym.Env):
             goal = tasks.sample_goal(self.cell, rng, config).centerline
         self._goal = goal
         self._estimate = self._observer.reset(self.cell)
-        return self._observation(), self._info(BoundaryDisplacement.zero(), "")
+        info = self._info(BoundaryDisplacement.zero(self.config.n_clamps), "")
+        if randomized is not None:
+            info["randomization"] = randomized
+        return self._observation(), info
 
     def step(
         self, action: ArrayLike
     ) -> tuple[dict[str, NDArray], float, bool, bool, dict[str, Any]]:
         if self._estimate is None:
             raise gym.error.ResetNeeded("call reset() before step()")
-        displacement = self.action_to_displacement(action)
+        displacement = self.delayed(self.action_to_displacement(action))
         before = self.cell.boundary
         termination = tasks.advance(self.cell, displacement, self.config)
         if self.cell.boundary is before:  # refused
-            displacement = BoundaryDisplacement.zero()
-        try:
-            self._estimate = self._observer.update(self.cell, displacement)
-        except TrackLost:
+            displacement = BoundaryDisplacement.zero(self.config.n_clamps)
+        if not self.observe(displacement):
             termination = termination or "track_lost"
         observation = self._observation()
         info = self._info(displacement, termination)
@@ -198,6 +217,19 @@ class ShapeControlEnv(gym.Env):
             observation["achieved_goal"], observation["desired_goal"], info
         )
         return observation, float(reward), bool(termination), False, info
+
+    def delayed(self, displacement: BoundaryDisplacement) -> BoundaryDisplacement:
+        """The motion that the arms make now that ``displacement`` is asked of them."""
+        self._commands.append(displacement)
+        return self._commands.popleft()
+
+    def observe(self, displacement: BoundaryDisplacement) -> bool:
+        """Look at the cell after its clamps have moved; False if the rod is lost from sight."""
+        try:
+            self._estimate = self._observer.update(self.cell, displacement)
+        except TrackLost:
+            return False
+        return True
 
     def compute_reward(
         self,
@@ -251,6 +283,22 @@ class ShapeControlEnv(gym.Env):
         self._observer.close()
         self.cell.close()
 
+    def _randomize(self) -> dict[str, Any]:
+        """Sample what ``randomization`` has ranges of, and set the cell up so."""
+        assert self.config.randomization is not None
+        values = self.config.randomization.sample(self.np_random, self.cell.cameras)
+        self.cell.replace_rod(
+            randomized_properties(self.config.properties, values),
+            Appearance(
+                values.get("rod_color"),
+                believed_cameras(self.cell.cameras, values),
+                values.get("camera_latency", 0),
+            ),
+        )
+        still = [BoundaryDisplacement.zero(self.config.n_clamps)] * values.get("arm_latency", 0)
+        self._commands = deque(still)
+        return values
+
     def _make_observation_space(self) -> spaces.Dict:
         n_nodes = self.config.n_nodes
         # No point of a cable in reach of the arms is further than 2 m from the origin.
@@ -285,7 +333,7 @@ class ShapeControlEnv(gym.Env):
             "occlusion_ratio": hidden,
             "wrench_left": state.wrench_left.copy(),
             "wrench_right": state.wrench_right.copy(),
-            "displacement": displacement.vector,
+            "displacement": two_clamps(displacement.vector),
             "termination": termination,
         }
 
@@ -294,16 +342,34 @@ def shape_observation(
     centerline: Array, boundary: BoundaryPoses, goal: Array
 ) -> dict[str, NDArray]:
     """The observation of a centerline (n, 3) [m] held at ``boundary``, for a goal (n, 3) [m]."""
-    clamps = [clamp_numbers(clamp) for clamp in (boundary.left, boundary.right)]
+    return flat_observation(centerline, boundary.clamps, goal)
+
+
+def two_clamps(vectors: Array) -> Array:
+    """Motions (..., 12) of both clamps, of (..., 12) or those of the left one alone (..., 6)."""
+    both = np.zeros((*vectors.shape[:-1], 12))
+    both[..., : vectors.shape[-1]] = vectors
+    return both
+
+
+def flat_observation(centerlines: Array, clamps: Array, goals: Array) -> dict[str, NDArray]:
+    """Observations of centerlines (..., n, 3) [m] held at clamps (..., k, 4, 4), for goals
+    (..., n, 3) [m]."""
+    batch = centerlines.shape[:-2]
+    points = centerlines.reshape(*batch, -1)
+    held = np.zeros((*batch, 18))  # of a free right end nothing
+    numbers = clamps[..., :3, [3, 0, 2]].swapaxes(-1, -2).reshape(*batch, -1)
+    held[..., : numbers.shape[-1]] = numbers
     return {
-        "observation": np.concatenate([centerline.ravel(), *clamps]).astype(np.float32),
-        "achieved_goal": centerline.ravel().astype(np.float32),
-        "desired_goal": goal.ravel().astype(np.float32),
+        "observation": np.concatenate([points, held], axis=-1).astype(np.float32),
+        "achieved_goal": points.astype(np.float32),
+        "desired_goal": goals.reshape(*batch, -1).astype(np.float32),
     }
 
 
-def check_goal(goal: ArrayLike, config: ShapeEnvConfig) -> Array:
-    """``goal`` as a centerline (n_nodes, 3) that the rod of ``config`` can take.
+def check_goal(goal: ArrayLike, config: ShapeEnvConfig, length: float | None = None) -> Array:
+    """``goal`` as a centerline (n_nodes, 3) that the rod of ``config`` can take, or one of another
+    ``length`` [m].
 
     Raises:
         ValueError: on a wrong shape, a value that is not finite, or an overstretched goal.
@@ -314,9 +380,11 @@ def check_goal(goal: ArrayLike, config: ShapeEnvConfig) -> Array:
             f"goal: expected a finite centerline of shape ({config.n_nodes}, 3),"
             f" got shape {goal.shape}"
         )
-    length = config.properties.length
+    length = config.properties.length if length is None else length
     span, along = float(np.linalg.norm(goal[-1] - goal[0])), float(arc_length(goal)[-1])
-    if span > config.max_stretch * length or along > LONGEST_GOAL * length:
+    if (
+        span > config.max_stretch * length and not config.free_end
+    ) or along > LONGEST_GOAL * length:
         raise ValueError(
             f"goal: overstretched: its ends are {span:.4f} m apart and it is {along:.4f} m long,"
             f" for a rod of {length:.4f} m with max_stretch {config.max_stretch}"

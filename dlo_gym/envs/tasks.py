@@ -12,10 +12,13 @@ from dlo_gym.envs.config import ShapeEnvConfig
 from dlo_gym.exceptions import RodDiverged, UnreachablePose
 from dlo_gym.geometry.se3 import Array, exp_so3, pose
 from dlo_gym.metrics import ptp_3d
-from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
+from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses, displace
+from dlo_gym.scene.clearance import clearance
 
 DENSE_UNIT = 0.1  # mean node error that costs 1 per step [m]
 ATTEMPTS = 200
+BLOCKED_ATTEMPTS = 5000  # of which one in some hundred is blocked, at a millisecond each
+DETOURS = 10  # tried per blocked way
 GOAL_STRETCH = 0.95  # of the largest distance between the clamps, at the goal
 
 
@@ -81,23 +84,65 @@ def advance(cell: SimulatedCell, displacement: BoundaryDisplacement, config: Sha
 
     A motion that cannot be made leaves the cell as it was.
     """
-    distance = _distance_after(cell.boundary, displacement)
+    return advance_all([cell], displacement.vector.reshape(1, -1, 6), config)[0]
+
+
+def advance_all(cells: Sequence[SimulatedCell], twists: Array, config: ShapeEnvConfig) -> list[str]:
+    """``advance`` of each of n cells by twists (n, k, 6) [m], [rad] of their k clamps.
+
+    What the arms do is worked out for all cells at once.
+    """
+    clamps = np.stack([cell.boundary.clamps for cell in cells])
+    reasons = _clamps_apart(cells, clamps[..., :3, 3] + twists[..., :3], config)
+    joint_angles: Sequence[Array | None] = [None] * len(cells)
+    arms = cells[0].arms
+    if arms is not None:
+        guesses = np.stack([_joint_angles(cell) for cell in cells])
+        joint_angles = list(arms.reach(displace(clamps, twists), guesses))
+    for i, (cell, twist, angles) in enumerate(zip(cells, twists, joint_angles, strict=True)):
+        reasons[i] = reasons[i] or _move(cell, twist, angles)
+    moved = [i for i, reason in enumerate(reasons) if not reason]
+    if arms is not None and moved:
+        gaps = clearance(arms.T_world_base, np.stack([_joint_angles(cells[i]) for i in moved]))
+        for i, touching in zip(moved, gaps.smallest < 0.0, strict=True):
+            reasons[i] = "collision" if touching else ""
+    for i in moved:
+        lowest = cells[i].rod_state.positions[:, 2].min()
+        if not reasons[i] and lowest < np.max(cells[i].properties.radius):
+            reasons[i] = "table_contact"
+    return reasons
+
+
+def _clamps_apart(cells: Sequence[SimulatedCell], ends: Array, config: ShapeEnvConfig) -> list[str]:
+    """Which of the cells' clamps at ``ends`` (n, k, 3) [m] are too far apart or too near."""
+    if ends.shape[1] == 1:
+        return [""] * len(cells)
+    distances = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    longest = config.max_stretch * np.array([cell.properties.length for cell in cells])
     # A command that the safety gate cut to a limit stands on it up to rounding.
-    if distance > config.max_stretch * config.properties.length + 1e-9:
-        return "overstretch"
-    if distance < config.min_gripper_distance - 1e-9:
-        return "collision"
+    return [
+        "overstretch" if far else ("collision" if near else "")
+        for far, near in zip(
+            distances > longest + 1e-9, distances < config.min_gripper_distance - 1e-9, strict=True
+        )
+    ]
+
+
+def _move(cell: SimulatedCell, twist: Array, joint_angles: Array | None) -> str:
+    if joint_angles is not None and np.isnan(joint_angles).any():
+        return "unreachable"
     try:
-        state = cell.move(displacement)
+        cell.move(BoundaryDisplacement(*twist), joint_angles)
     except UnreachablePose:
         return "unreachable"
     except RodDiverged:
         return "rod_diverged"
-    if cell.arms_in_collision():
-        return "collision"
-    if state.positions[:, 2].min() < np.max(config.properties.radius):
-        return "table_contact"
     return ""
+
+
+def _joint_angles(cell: SimulatedCell) -> Array:
+    assert cell.joint_angles is not None
+    return cell.joint_angles
 
 
 def reset_to_random_start(
@@ -116,7 +161,7 @@ def reset_to_random_start(
             cell.reset(_random_start(rng, config), occluders)
         except (UnreachablePose, RodDiverged, ValueError):
             continue
-        if advance(cell, BoundaryDisplacement.zero(), config) == "":
+        if advance(cell, BoundaryDisplacement.zero(config.n_clamps), config) == "":
             cell.reset(cell.boundary, occluders)
             return
     raise ValueError(
@@ -136,13 +181,13 @@ def sample_goal(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvC
     """
     start = cell.save()
     try:
-        for _ in range(ATTEMPTS):
+        for _ in range(BLOCKED_ATTEMPTS if config.straight_way == "blocked" else ATTEMPTS):
             cell.restore(start)
             if not _wander(cell, start.rod.boundary, rng, config):
                 continue
             goal = Goal(cell.rod_state.positions.copy(), cell.boundary)
             distance = shape_error(goal.centerline, start.rod.positions)
-            stretch = goal.boundary.distance / (config.max_stretch * config.properties.length)
+            stretch = goal.boundary.distance / (config.max_stretch * cell.properties.length)
             near, far = config.goal_distance
             if near <= distance <= far and stretch <= GOAL_STRETCH:
                 return goal
@@ -155,15 +200,6 @@ def sample_goal(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvC
     )
 
 
-def _distance_after(boundary: BoundaryPoses, displacement: BoundaryDisplacement) -> float:
-    """Between the clamps' origins once they have moved [m]."""
-    assert boundary.right is not None
-    assert displacement.right is not None
-    left = boundary.left[:3, 3] + displacement.left[:3]
-    right = boundary.right[:3, 3] + displacement.right[:3]
-    return float(np.linalg.norm(right - left))
-
-
 def _random_start(rng: np.random.Generator, config: ShapeEnvConfig) -> BoundaryPoses:
     along_x = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # d3 = +x, d2 = +z
     clamps = []
@@ -171,8 +207,10 @@ def _random_start(rng: np.random.Generator, config: ShapeEnvConfig) -> BoundaryP
         position = np.array([side * config.start_distance, 0.0, config.start_height])
         position += rng.uniform(-1.0, 1.0, 3) * config.start_noise[0]
         tilt = np.append(rng.uniform(-1.0, 1.0, 2) * config.start_noise[1], 0.0)
+        if config.planar:
+            position[1] = tilt[1] = 0.0
         clamps.append(pose(along_x @ exp_so3(tilt), position))
-    return BoundaryPoses(*clamps)
+    return BoundaryPoses(*clamps[: config.n_clamps])
 
 
 def _wander(
@@ -182,22 +220,91 @@ def _wander(
     config: ShapeEnvConfig,
 ) -> bool:
     """Follow ``goal_moves`` random motions in steps; False if one of them is not allowed."""
-    low, high = np.asarray(config.workspace)
-    starts = np.stack([start.left[:3, 3], start.right[:3, 3]])  # type: ignore[index]
-    for _ in range(config.goal_moves):
-        together = rng.uniform(-1.0, 1.0, 3)
-        apart = rng.uniform(-0.5, 0.5, (2, 3))
-        targets = np.clip(starts + config.goal_translation * (together + apart), low, high)
-        rotations = rng.uniform(-1.0, 1.0, (2, 2)) * config.goal_rotation
-        clamps = (cell.boundary.left, cell.boundary.right)
-        twists = [
-            np.concatenate([target - clamp[:3, 3], clamp[:3, :2] @ rotation])  # type: ignore[index]
-            for clamp, target, rotation in zip(clamps, targets, rotations, strict=True)
+    if config.straight_way == "blocked":
+        return _detour(cell, rng, config)
+    return all(
+        _follow(cell, _random_motion(cell.boundary, start, rng, config), config)
+        for _ in range(config.goal_moves)
+    )
+
+
+def _detour(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvConfig) -> bool:
+    """Follow a random motion whose straight way is blocked, around over a translation to somewhere
+    else; False if none of some is allowed."""
+    start = cell.save()
+    boundary = start.rod.boundary
+    motion = _random_motion(boundary, boundary, rng, config)
+    if not straight_way_blocked(cell, boundary.displaced(motion), config):
+        return False
+    for _ in range(DETOURS):
+        around = _random_motion(boundary, boundary, rng, config).vector.reshape(2, 6)
+        around[:, 3:] = 0.0
+        legs = [
+            BoundaryDisplacement(*around),
+            BoundaryDisplacement(*(motion.vector.reshape(2, 6) - around)),
         ]
-        motion = BoundaryDisplacement(*twists)
-        translation = np.abs(np.stack(twists)[:, :3]).max() / config.max_translation_step
-        n_steps = int(np.ceil(max(translation, np.abs(rotations).max() / config.max_rotation_step)))
-        for _ in range(n_steps):
-            if advance(cell, motion.scaled(1.0 / n_steps), config):
-                return False
-    return True
+        cell.restore(start)
+        if all(_follow(cell, leg, config) for leg in legs):
+            return True
+    return False
+
+
+def straight_way_blocked(cell: SimulatedCell, goal: BoundaryPoses, config: ShapeEnvConfig) -> bool:
+    """Whether the arms can hold ``goal``, but would collide or not reach on the straight way of
+    the cell's clamps to it."""
+    guess = cell.joint_angles
+    if cell.arms is None or guess is None:
+        return False
+    motion = cell.boundary.displacement_to(goal)
+    n_steps = _n_steps(motion, cell.boundary, config)
+    shares = np.arange(1, n_steps + 1)[:, None, None] / n_steps
+    starts = np.repeat(cell.boundary.clamps[None], n_steps, axis=0)
+    clamps = displace(starts, shares * motion.vector.reshape(-1, 6))
+    joint_angles = np.empty((n_steps, 2, 6))
+    for i in range(n_steps):
+        joint_angles[i] = cell.arms.reach(clamps[i], guess)
+        guess = np.where(np.isnan(joint_angles[i]), guess, joint_angles[i])
+    reached = ~np.isnan(joint_angles).any(axis=(1, 2))
+    gaps = clearance(cell.arms.T_world_base, np.nan_to_num(joint_angles)).smallest
+    passable = reached & (gaps >= 0.0)
+    return bool(passable[-1] and not passable.all())
+
+
+def _random_motion(
+    boundary: BoundaryPoses,
+    start: BoundaryPoses,
+    rng: np.random.Generator,
+    config: ShapeEnvConfig,
+) -> BoundaryDisplacement:
+    """From ``boundary`` to somewhere around ``start``."""
+    low, high = np.asarray(config.workspace)
+    together = rng.uniform(-1.0, 1.0, 3)
+    apart = rng.uniform(-0.5, 0.5, (2, 3))
+    offsets = config.goal_translation * (together + apart)[: config.n_clamps]
+    targets = np.clip(start.clamps[:, :3, 3] + offsets, low, high)
+    rotations = (rng.uniform(-1.0, 1.0, (2, 2)) * config.goal_rotation)[: config.n_clamps]
+    if config.planar:
+        targets[:, 1] = boundary.clamps[:, 1, 3]
+        rotations[:, 1] = 0.0
+    twists = [
+        np.concatenate([target - clamp[:3, 3], clamp[:3, :2] @ rotation])
+        for clamp, target, rotation in zip(boundary.clamps, targets, rotations, strict=True)
+    ]
+    return BoundaryDisplacement(*twists)
+
+
+def _n_steps(motion: BoundaryDisplacement, boundary: BoundaryPoses, config: ShapeEnvConfig) -> int:
+    """How many steps a motion from ``boundary`` takes within the limits."""
+    twists = motion.vector.reshape(-1, 6)
+    turns = boundary.clamps[:, :3, :3].swapaxes(-1, -2) @ twists[:, 3:, None]
+    largest = max(
+        np.abs(twists[:, :3]).max() / config.max_translation_step,
+        np.abs(turns).max() / config.max_rotation_step,
+    )
+    return max(1, int(np.ceil(largest)))
+
+
+def _follow(cell: SimulatedCell, motion: BoundaryDisplacement, config: ShapeEnvConfig) -> bool:
+    n_steps = _n_steps(motion, cell.boundary, config)
+    step = motion.scaled(1.0 / n_steps)
+    return not any(advance(cell, step, config) for _ in range(n_steps))

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from dlo_gym.geometry import _kernels_rotations as kernels
+
 Array = NDArray[np.float64]
 
 
@@ -27,9 +29,14 @@ def log_so3(rotations: ArrayLike) -> Array:
 
 def matrix_to_quaternion(rotations: ArrayLike) -> Array:
     """Unit quaternions wxyz (..., 4), w >= 0, of rotation matrices (..., 3, 3)."""
-    matrices = np.asarray(rotations, dtype=np.float64)
-    xyzw = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat(canonical=True)
-    return np.roll(xyzw, 1, axis=-1).reshape(*matrices.shape[:-2], 4)
+    matrices = np.array(rotations, dtype=np.float64)
+    single = matrices.reshape(-1, 3, 3)
+    quaternions = np.empty((len(single), 4))
+    if not kernels.matrix_to_quaternion(single, quaternions):
+        # SciPy finds the nearest rotation, or says what is wrong.
+        xyzw = Rotation.from_matrix(single).as_quat(canonical=True)
+        quaternions = np.roll(xyzw, 1, axis=-1)
+    return quaternions.reshape(*matrices.shape[:-2], 4)
 
 
 def quaternion_to_matrix(quaternions: ArrayLike) -> Array:

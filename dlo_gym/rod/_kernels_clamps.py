@@ -7,7 +7,7 @@ from numba import njit
 
 
 @njit(cache=True)
-def displace(clamp, twist, out):
+def displace_clamp(clamp, twist, out):
     """Update the pose ``out`` (4, 4) to ``clamp`` moved by ``twist`` (6,), both in world axes."""
     x, y, z = twist[3], twist[4], twist[5]
     angle = sqrt(x * x + y * y + z * z)
@@ -36,6 +36,13 @@ def displace(clamp, twist, out):
         out[i, 3] = clamp[i, 3] + twist[i]
         out[3, i] = 0.0
     out[3, 3] = 1.0
+
+
+@njit(cache=True)
+def displace_clamps(clamps, twists, out):
+    """Update the poses ``out`` (m, 4, 4) to ``clamps`` moved by ``twists`` (m, 6)."""
+    for i in range(clamps.shape[0]):
+        displace_clamp(clamps[i], twists[i], out[i])
 
 
 @njit(cache=True)

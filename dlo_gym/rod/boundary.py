@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dlo_gym.geometry.se3 import Array, check_single_pose, log_so3
-from dlo_gym.rod._kernels_clamps import displace
+from dlo_gym.rod._kernels_clamps import displace_clamp, displace_clamps
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +31,11 @@ class BoundaryPoses:
             object.__setattr__(self, "right", check_single_pose(self.right, "clamp right"))
 
     @property
+    def clamps(self) -> Array:
+        """(2, 4, 4) left then right, or (1, 4, 4) if the right end is free."""
+        return np.stack([self.left] if self.right is None else [self.left, self.right])
+
+    @property
     def distance(self) -> float:
         """Between the two clamps' origins [m]; 0 if one end is free."""
         if self.right is None:
@@ -44,9 +49,15 @@ class BoundaryPoses:
                 "displacement: must move the right clamp exactly if it exists, got "
                 f"right={displacement.right} for right clamp {self.right}"
             )
-        poses = object.__new__(BoundaryPoses)  # what is rigid stays so: no need to check again
-        right = None if self.right is None else _displace(self.right, displacement.right)
-        object.__setattr__(poses, "left", _displace(self.left, displacement.left))
+        left = _displaced(self.left, displacement.left)
+        right = None if self.right is None else _displaced(self.right, displacement.right)
+        return BoundaryPoses.of_rigid(left, right)
+
+    @classmethod
+    def of_rigid(cls, left: Array, right: Array | None = None) -> "BoundaryPoses":
+        """From float64 poses that are rigid already; not checked again."""
+        poses = object.__new__(cls)
+        object.__setattr__(poses, "left", left)
         object.__setattr__(poses, "right", right)
         return poses
 
@@ -86,8 +97,8 @@ class BoundaryDisplacement:
             object.__setattr__(self, side, value)
 
     @classmethod
-    def zero(cls) -> "BoundaryDisplacement":
-        return cls(np.zeros(6), np.zeros(6))
+    def zero(cls, n_clamps: int = 2) -> "BoundaryDisplacement":
+        return cls(*np.zeros((n_clamps, 6)))
 
     @classmethod
     def from_vector(cls, vector: ArrayLike) -> "BoundaryDisplacement":
@@ -106,10 +117,22 @@ class BoundaryDisplacement:
         return BoundaryDisplacement.from_vector(factor * self.vector)
 
 
-def _displace(clamp: Array, twist: Array | None) -> Array:
+def displace(clamps: Array, twists: Array) -> Array:
+    """Clamp poses (..., 4, 4) moved by twists (..., 6) [m], [rad], each as a
+    ``BoundaryDisplacement`` has it."""
+    moved = np.empty(clamps.shape)
+    displace_clamps(
+        np.ascontiguousarray(clamps).reshape(-1, 4, 4),
+        np.ascontiguousarray(twists).reshape(-1, 6),
+        moved.reshape(-1, 4, 4),
+    )
+    return moved
+
+
+def _displaced(clamp: Array, twist: Array | None) -> Array:
     assert twist is not None
     moved = np.empty((4, 4))
-    displace(clamp, twist, moved)
+    displace_clamp(clamp, twist, moved)
     return moved
 
 

@@ -79,16 +79,24 @@ class DualArm:
         """
         guess = self.home if guess is None else _check_joint_angles(guess, "guess")
         clamps = [clamp for clamp in (boundary.left, boundary.right) if clamp is not None]
-        k = len(clamps)
-        T_base_flange = self.flange_in_base(np.stack(clamps))
-        joint_angles = guess.copy()
-        joint_angles[:k] = nearest_solution(T_base_flange, guess[:k])
-        for side, clamp, flange in zip(SIDES, clamps, T_base_flange, strict=False):
-            if np.isnan(joint_angles[SIDES.index(side), 0]):
-                raise UnreachablePose(
-                    f"{side} arm cannot hold the rod's end at {np.round(clamp[:3, 3], 4).tolist()}"
-                    f" m along {np.round(clamp[:3, 2], 3).tolist()}: {why_unreachable(flange)}"
-                )
+        joint_angles = self.reach(np.stack(clamps), guess)
+        if not np.isnan(joint_angles).any():
+            return joint_angles
+        side = int(np.argmax(np.isnan(joint_angles).any(axis=1)))
+        clamp, flange = clamps[side], self.flange_in_base(np.stack(clamps))[side]
+        raise UnreachablePose(
+            f"{SIDES[side]} arm cannot hold the rod's end at {np.round(clamp[:3, 3], 4).tolist()}"
+            f" m along {np.round(clamp[:3, 2], 3).tolist()}: {why_unreachable(flange)}"
+        )
+
+    def reach(self, clamps: Array, guess: Array) -> Array:
+        """Joint angles (..., 2, 6) [rad] nearest to ``guess`` (..., 2, 6) that hold clamps
+        (..., k, 4, 4) of the first k arms; NaN where an arm cannot reach its clamp."""
+        k = clamps.shape[-3]
+        joint_angles = np.array(np.broadcast_to(guess, (*clamps.shape[:-3], 2, 6)))
+        joint_angles[..., :k, :] = nearest_solution(
+            self.flange_in_base(clamps), joint_angles[..., :k, :]
+        )
         return joint_angles
 
     def forward_kinematics(self, joint_angles: ArrayLike) -> BoundaryPoses:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dlo_gym.geometry.se3 import Array
-from dlo_gym.scene.ur5e import link_frames
+from dlo_gym.scene import _kernels_arms as kernels
 
 # Capsules around the links and the gripper: DH frame, axis from, axis to [m], radius [m].
 CAPSULES = (
@@ -50,7 +50,13 @@ class Clearance(NamedTuple):
 
     @property
     def minimum(self) -> float:
-        return min(float(np.min(distances)) for distances in self)
+        return float(np.min(self.smallest))
+
+    @property
+    def smallest(self) -> Array:
+        """(...) the smallest of the distances of each pair of arms [m]."""
+        own = np.minimum(self.to_table, self.within_arm).min(axis=-1)
+        return np.minimum(self.between_arms, own)
 
 
 def capsule_axes(T_world_base: Array, joint_angles: Array) -> Array:
@@ -60,40 +66,34 @@ def capsule_axes(T_world_base: Array, joint_angles: Array) -> Array:
         T_world_base: (2, 4, 4) of the arms' base frames.
         joint_angles: (..., 2, 6) [rad].
     """
-    T = (T_world_base[:, None] @ link_frames(joint_angles))[..., CAPSULE_FRAMES, :, :]
-    return (T[..., None, :3, :3] @ CAPSULE_ENDS[..., None])[..., 0] + T[..., None, :3, 3]
+    axes = np.empty((*joint_angles.shape[:-2], 2, len(CAPSULES), 2, 3))
+    kernels.capsule_axes(
+        np.array(T_world_base),
+        np.array(joint_angles).reshape(-1, 2, 6),
+        CAPSULE_FRAMES,
+        CAPSULE_ENDS,
+        axes.reshape(-1, *axes.shape[-4:]),
+    )
+    return axes
 
 
 def clearance(T_world_base: Array, joint_angles: Array) -> Clearance:
     """Clearances of arms on bases (2, 4, 4) at joint angles (..., 2, 6) [rad]."""
     axes = capsule_axes(T_world_base, joint_angles)
-    batch, n = axes.shape[:-4], len(CAPSULES)
-    a, b = _SELF_PAIRS.T
-    # One call for all pairs: the time goes into calls, not into numbers.
-    across = np.broadcast_arrays(axes[..., 0, :, None, :, :], axes[..., 1, None, :, :, :])
-    first, second = (
-        np.concatenate([x.reshape(*batch, -1, 2, 3), within.reshape(*batch, -1, 2, 3)], axis=-3)
-        for x, within in zip(across, (axes[..., a, :, :], axes[..., b, :, :]), strict=True)
-    )
-    gaps = segment_distances(first, second)
-    between = gaps[..., : n**2] - (CAPSULE_RADII[:, None] + CAPSULE_RADII).ravel()
-    within = gaps[..., n**2 :].reshape(*batch, 2, -1) - CAPSULE_RADII[a] - CAPSULE_RADII[b]
-    table = (axes[..., 2].min(axis=-1) - CAPSULE_RADII)[..., _ABOVE_TABLE]
-    return Clearance(between.min(axis=-1), table.min(axis=-1), within.min(axis=-1))
+    axes = axes.reshape(-1, *axes.shape[-4:])
+    between, table, within = np.empty(len(axes)), np.empty((len(axes), 2)), np.empty((len(axes), 2))
+    kernels.clearances(axes, CAPSULE_RADII, _ABOVE_TABLE, _SELF_PAIRS, between, table, within)
+    batch = joint_angles.shape[:-2]
+    return Clearance(between.reshape(batch), table.reshape(*batch, 2), within.reshape(*batch, 2))
 
 
 def segment_distances(first: Array, second: Array) -> Array:
-    """Distances (...) [m] between line segments (..., 2, 3), given by their ends.
-
-    Ericson, Real-Time Collision Detection, 5.1.9.
-    """
-    start, d1 = first[..., 0, :], first[..., 1, :] - first[..., 0, :]
-    d2 = second[..., 1, :] - second[..., 0, :]
-    r = start - second[..., 0, :]
-    a, e = (d1 * d1).sum(-1) + 1e-15, (d2 * d2).sum(-1) + 1e-15
-    b, c, f = (d1 * d2).sum(-1), (d1 * r).sum(-1), (d2 * r).sum(-1)
-    determinant = a * e - b * b
-    s = np.clip((b * f - c * e) / np.maximum(determinant, 1e-15), 0.0, 1.0)
-    t = np.clip((b * s + f) / e, 0.0, 1.0)
-    s = np.clip((b * t - c) / a, 0.0, 1.0)
-    return np.linalg.norm(r + s[..., None] * d1 - t[..., None] * d2, axis=-1)
+    """Distances (...) [m] between line segments (..., 2, 3), given by their ends."""
+    batch = np.broadcast_shapes(first.shape[:-2], second.shape[:-2])
+    distances = np.empty(batch)
+    kernels.segment_distances(
+        np.array(np.broadcast_to(first, (*batch, 2, 3))).reshape(-1, 2, 3),
+        np.array(np.broadcast_to(second, (*batch, 2, 3))).reshape(-1, 2, 3),
+        distances.reshape(-1),
+    )
+    return distances

@@ -61,6 +61,7 @@ class SceneRenderer:
         moving = np.concatenate([self._rod, self._occluders])
         fixed = np.setdiff1d(np.flatnonzero(self.model.geom_bodyid == 0), moving)
         self.model.geom_group[fixed] = SCENERY_GROUP
+        self.rod_radius = self.config.rod_radius
         self._positions: Array | None = None
         self._primitives = ModelPrimitives(self.model)
         self._canvas: Canvas | None = None
@@ -125,6 +126,13 @@ class SceneRenderer:
         self._pose_rod(positions)
         self._pose_occluders(occluders)
 
+    def dress_rod(self, radius: float, color: ArrayLike | None = None) -> None:
+        """Draw the rod with another ``radius`` [m] and RGB in [0, 1], the config's where None."""
+        self.rod_radius = radius
+        self.model.geom_size[self._rod, 0] = radius
+        rgb = self.config.rod_color if color is None else color
+        self.model.mat_rgba[self.model.material("rod").id, :3] = rgb
+
     def _pose_rod(self, positions: Array) -> None:
         # Written over mj_kinematics' result: fifty bodies that never interact need no joints.
         axes = np.diff(positions, axis=0)
@@ -136,7 +144,7 @@ class SceneRenderer:
         self.data.geom_xpos[self._rod] = (positions[1:] + positions[:-1]) / 2
         self.data.geom_xmat[self._rod] = frames.reshape(-1, 9)
         self.model.geom_size[self._rod, 1] = lengths[:, 0] / 2
-        self.model.geom_rbound[self._rod] = lengths[:, 0] / 2 + self.config.rod_radius
+        self.model.geom_rbound[self._rod] = lengths[:, 0] / 2 + self.rod_radius
         self._positions = positions
 
     def _pose_occluders(self, occluders: Array) -> None:
@@ -182,13 +190,13 @@ class SceneRenderer:
         positions = self._require_positions()
         if len(positions) == 0:
             return np.zeros(0, dtype=bool)
-        facing = _facing_points(positions, camera.centre, self.config.rod_radius)
+        facing = _facing_points(positions, camera.centre, self.rod_radius)
         rays = facing - camera.centre
         distances = np.linalg.norm(rays, axis=1)
         rays /= distances[:, None]
         visible = np.array(camera.sees(camera.project(positions)))
         hits = first_hits(camera.centre, rays, self._primitives.posed(self.data))
-        return visible & (hits >= distances - self.config.rod_radius)
+        return visible & (hits >= distances - self.rod_radius)
 
     def arms_in_collision(self) -> bool:
         """Whether arms or grippers touch each other, themselves or the table."""

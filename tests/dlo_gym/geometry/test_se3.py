@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
 
 from dlo_gym.geometry import se3
 
@@ -24,6 +25,7 @@ def test_log_undoes_exp(rotation_vector):
     )
 
 
+@settings(deadline=None)  # the first call compiles
 @given(vectors)
 def test_quaternions_are_the_same_rotation(rotation_vector):
     R = se3.exp_so3(rotation_vector)
@@ -77,3 +79,21 @@ def test_frame_along_is_right_handed_with_d3_along_the_tangent(tangent, referenc
 def test_check_pose_names_what_is_wrong(spoil, message):
     with pytest.raises(ValueError, match=f"clamp left.*{message}"):
         se3.check_pose(spoil(np.eye(4)), "clamp left")
+
+
+def test_quaternions_are_scipys_to_the_last_bit():
+    group = Rotation.create_group("O").as_matrix()  # every tie of the largest component
+    turns = Rotation.from_rotvec(2.0 * np.random.default_rng(0).normal(size=(500, 3))).as_matrix()
+    rotations = np.concatenate([group, np.round(group), turns])
+    scipys = np.roll(Rotation.from_matrix(rotations).as_quat(canonical=True), 1, axis=-1)
+    np.testing.assert_array_equal(se3.matrix_to_quaternion(rotations), scipys)
+
+
+def test_quaternions_of_what_is_nearly_a_rotation_are_of_the_nearest():
+    R = se3.exp_so3([0.0, 0.0, 0.3])
+    stretched = R * [1.0 + 1e-5, 1.0, 1.0]
+    np.testing.assert_allclose(
+        se3.matrix_to_quaternion(stretched), se3.matrix_to_quaternion(R), atol=1e-5
+    )
+    with pytest.raises(ValueError, match="determinant"):
+        se3.matrix_to_quaternion(np.diag([1.0, 1.0, -1.0]))
