@@ -24,7 +24,7 @@ from sim2real.identify import (
 )
 
 SECONDS = 2.0  # of each clip that is identified from: later, small errors have grown
-ELEMENTS, ITERATIONS = 16, 5
+ELEMENTS, ITERATIONS = 16, 6
 
 
 def identify_cable(known: list[CableMotion], progress: Progress, name: str) -> Identified:
@@ -45,8 +45,8 @@ def errors(motions: list[CableMotion], parameters: CableParameters) -> np.ndarra
         [
             motion.error(points) if np.isfinite(points).all() else np.nan
             for points in (
-                predict(motion, parameters),
-                predict_at_rest(motion, parameters),
+                predict(motion, parameters, ELEMENTS),
+                predict_at_rest(motion, parameters, ELEMENTS),
                 predict_blend(motion),
             )
         ]

@@ -111,7 +111,7 @@ class CableParameters(NamedTuple):
                      for v, log in zip(vector, LOGARITHMIC, strict=True)))  # fmt: skip
 
 
-def predict(motion: CableMotion, parameters: CableParameters, n_elements: int = 24) -> Array:
+def predict(motion: CableMotion, parameters: CableParameters, n_elements: int = 16) -> Array:
     """Points (n_samples, n_points, 3) [m] from the first two samples and the clamps' motion alone.
 
     The rod starts in the shape of the first sample with the velocities that take it to the second.
@@ -132,7 +132,7 @@ def predict(motion: CableMotion, parameters: CableParameters, n_elements: int = 
 
 
 def predict_at_rest(
-    motion: CableMotion, parameters: CableParameters, n_elements: int = 24
+    motion: CableMotion, parameters: CableParameters, n_elements: int = 16
 ) -> Array:
     """As ``predict``, but in equilibrium at every sample: no inertia."""
     rod = CosseratRod(parameters.properties(motion.length), n_elements, clamp="node")
@@ -226,7 +226,7 @@ class Identified(NamedTuple):
 def identify(
     motions: Sequence[CableMotion],
     start: CableParameters | None = None,
-    n_elements: int = 24,
+    n_elements: int = 16,
     max_iterations: int = 12,
     callback: Callable[[int, float], None] | None = None,
 ) -> Identified:

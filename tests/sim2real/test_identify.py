@@ -26,7 +26,7 @@ def swept(seed: int, noise: float = 0.0) -> CableMotion:
         poses[:, :3, :3] = exp_so3(phase[:, None] * rng.uniform(-0.5, 0.5, 3)) @ poses[:, :3, :3]
         clamps.append(poses)
     arc_length = np.linspace(0.1, 0.8, 8)
-    rod = identify.CosseratRod(TRUTH.properties(LENGTH), 24, clamp="node")
+    rod = identify.CosseratRod(TRUTH.properties(LENGTH), 16, clamp="node")
     state = rod.settle(BoundaryPoses(clamps[0][0], clamps[1][0]))
     empty = CableMotion(PERIOD, *clamps, np.zeros((SAMPLES, 8, 3)), arc_length, LENGTH)
     first = identify._at(state.positions, empty)
