@@ -68,12 +68,15 @@ def soak(config: CellConfig, minutes: float) -> Iterator[Soak]:
     with EmulatedCell.of(config) as emulation, RobotCell(config) as robot:
         robot.open()
         robot.engage()
-        home = robot.commanded  # goals are drawn from here, or they would wander off
+        home, home_shape = robot.commanded, emulation.truth().centerline
         for goal_seed in itertools.count():
             if time.monotonic() >= end:
                 return
             _make_ready(robot, result)
-            loop = ClosedLoop(config, make_goal("sampled", config, home, goal_seed))
+            # To a goal and home again, else the arms would wander off.
+            away = goal_seed % 2 == 0
+            goal = make_goal("sampled", config, home, goal_seed) if away else home_shape
+            loop = ClosedLoop(config, goal)
             for step in control_steps(robot, loop, steps=EPISODE, recoveries=RECOVERIES):
                 result.steps += 1
                 result.late.append(step.late)

@@ -1,5 +1,6 @@
 """Steps of the grippers that the arms can follow without touching each other or the table."""
 
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ CLEARANCES = (
     *(f"{side} arm to the table" for side in SIDES),
     *(f"{side} arm to itself" for side in SIDES),
 )
+WRISTS = tuple(f"{side} arm's wrist" for side in SIDES)
 
 
 class Followed(NamedTuple):
@@ -54,7 +56,8 @@ class _Tried(NamedTuple):
 class ArmSteps:
     """A step (k, 2, 3) of clamps at poses (k, 4, 4), as far as the arms can follow it.
 
-    Keeps reach, joint speed and acceleration, and the clearances of the arms. These limits are
+    Keeps reach, joint speed and acceleration, the clearances of the arms and their wrists out of
+    the singularity. These limits are
     not convex, so the step is looked at in ``POINTS`` points of its way. A limit that is already
     broken at the poses is widened to what it is there: standing still always passes.
 
@@ -71,6 +74,7 @@ class ArmSteps:
     ) -> None:
         self.limits, self.arms, self.clamps = limits, arms, clamps
         self.guess, self.former = joint_angles, former
+        self.wrist_sides = np.sign(np.sin(joint_angles[:, 4]))
         self._stands = False
 
     def cut(self, step: Array, allowed: AllowedSteps) -> Followed:
@@ -80,7 +84,7 @@ class ArmSteps:
             SafetyStop: if an arm cannot hold its clamp where it is.
         """
         fraction, straight = self._straight(step)
-        near = any(violation.limit == "clearance" for violation in straight.violations)
+        near = any(one.limit in ("clearance", "singularity") for one in straight.violations)
         if fraction < BLOCKED and near:
             slid = self._slid(step)
             slid = allowed.largest_fraction(slid) * slid
@@ -109,7 +113,7 @@ class ArmSteps:
         """Fractions (m,) of ``step`` (k, 2, 3); the first time from zero, so that where the arms
         are needs no call of its own."""
         joint_angles = self.reached(fractions[:, None, None, None] * step)
-        near = clearances(self.arms, joint_angles)
+        near = self._margins(joint_angles)
         if not self._stands:
             self._stand(joint_angles[0], near[0])
         values = np.concatenate([self._rates(joint_angles), near], axis=1)
@@ -117,11 +121,11 @@ class ArmSteps:
         return _Tried(fractions, joint_angles, values, np.asarray(passed))
 
     def _stand(self, joint_angles: Array, near: Array) -> None:
-        """Takes joint angles (2, 6) and clearances (5,) for where the arms are: steps count from
+        """Takes joint angles (2, 6) and margins (7,) for where the arms are: steps count from
         there, limits are widened to it."""
         if not np.isfinite(joint_angles).all():
             raise _unreachable(self.arms, self.clamps, self.guess)
-        self.start, self.clearance, self._stands = joint_angles, near, True
+        self.start, self.margins, self._stands = joint_angles, near, True
         joints = (
             ("joint speed", "rad/s", self.limits.max_joint_speed),
             ("joint acceleration", "rad/s^2", self.limits.max_joint_acceleration),
@@ -131,10 +135,14 @@ class ArmSteps:
             for name, unit, bound in joints
             for side in SIDES
         ]
-        least = np.minimum(self.limits.min_arm_clearance, self.clearance).tolist()
         self.rows += [
-            ("clearance", what, "m", bound, True)
-            for what, bound in zip(CLEARANCES, least, strict=True)
+            ("clearance", what, "m", min(self.limits.min_arm_clearance, margin), True)
+            for what, margin in zip(CLEARANCES, near[:-2].tolist(), strict=True)
+        ]
+        angle = self.limits.min_wrist_angle or -inf
+        self.rows += [
+            ("singularity", what, "rad", min(angle, margin), True)
+            for what, margin in zip(WRISTS, near[-2:].tolist(), strict=True)
         ]
         self.bounds = np.array([row[3] for row in self.rows])
         self.signs = np.array([-1.0 if row[4] else 1.0 for row in self.rows])
@@ -150,6 +158,12 @@ class ArmSteps:
         flanges = self.arms.flange_in_base(clamps)
         joint_angles[:, :k] = nearest_solution(flanges, self.guess[:k])
         return joint_angles
+
+    def _margins(self, joint_angles: Array) -> Array:
+        """(m, 7) clearances [m] of joint angles (m, 2, 6), and how far either wrist is from its
+        singularity [rad], negative on the other side of it."""
+        wrists = self.wrist_sides * np.arcsin(np.sin(joint_angles[:, :, 4]))
+        return np.concatenate([clearances(self.arms, joint_angles), wrists], axis=1)
 
     def _rates(self, joint_angles: Array) -> Array:
         """(m, 4) largest joint speeds of the arms [rad/s], then accelerations [rad/s^2], on the
@@ -181,10 +195,10 @@ class ArmSteps:
         k = len(self.clamps)
         scale = np.tile(np.repeat([1.0, 1.0 / LEVER], 3), k)
         tried = np.eye(6 * k) * DIFFERENCE * scale
-        near = clearances(self.arms, self.reached(tried.reshape(-1, k, 2, 3)))
-        # (5, 6 k); NaN at the edge of an arm's reach, where nothing can be said.
-        gradients = np.nan_to_num(((near - self.clearance) / DIFFERENCE).T)
-        room = self.bounds[-len(CLEARANCES) :] - self.clearance
+        near = self._margins(self.reached(tried.reshape(-1, k, 2, 3)))
+        # (7, 6 k); NaN at the edge of an arm's reach, where nothing can be said.
+        gradients = np.nan_to_num(((near - self.margins) / DIFFERENCE).T)
+        room = self.bounds[-len(self.margins) :] - self.margins
         scaled = step.ravel() / scale
         lift = LIFT * float(np.linalg.norm(scaled))
         # Rounds of projections onto each surface's half-space, from which the others may push.

@@ -90,6 +90,9 @@ class SafetyLimits:
         max_joint_acceleration: of every joint [rad/s^2], as ``max_acceleration``.
         min_arm_clearance: between the arms, to the table and of an arm to itself, between the
             capsules of ``dlo_gym.scene.arms`` [m].
+        min_wrist_angle: between the axes of an arm's fourth and sixth joint [rad]. Where they fall
+            together the wrist is singular: these joints race, and the robot stops by itself. Nor
+            does a step lead through to the other side. 0 for no limit.
         max_force: that the world may exert on a gripper, beyond the tare [N].
         max_torque: the same about the TCP [N m].
         max_tension: of that force along the line between the clamps, in either direction [N]:
@@ -120,6 +123,7 @@ class SafetyLimits:
     max_joint_speed: float = pi
     max_joint_acceleration: float = inf
     min_arm_clearance: float = 0.01
+    min_wrist_angle: float = 0.0
     max_force: float = 50.0
     max_torque: float = 5.0
     max_tension: float = 20.0
@@ -138,7 +142,7 @@ class SafetyLimits:
                     f"{name}: expected a positive number, inf for no limit,"
                     f" got {getattr(self, name)}"
                 )
-        for name in ("min_arm_clearance", "measured_tolerance"):
+        for name in ("min_arm_clearance", "min_wrist_angle", "measured_tolerance"):
             value = getattr(self, name)
             if not (isfinite(value) and value >= 0):
                 raise ValueError(f"{name}: expected zero or a positive number, got {value}")

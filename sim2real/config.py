@@ -131,6 +131,7 @@ class LimitsSection(_Section):
     min_gripper_distance_m: Positive = 0.05
     max_stretch: Share = 0.975
     min_arm_clearance_m: Annotated[float, Field(ge=0)] = 0.02
+    min_wrist_angle_rad: Annotated[float, Field(ge=0)] = 0.1
     max_force_n: Positive = 40.0
     max_torque_nm: Positive = 8.0
     max_tension_n: Positive = 20.0
@@ -258,6 +259,7 @@ class CellConfig(_Section):
             max_joint_speed=limits.max_joint_speed_rad_s,
             max_joint_acceleration=limits.max_joint_acceleration_rad_s2,
             min_arm_clearance=limits.min_arm_clearance_m,
+            min_wrist_angle=limits.min_wrist_angle_rad,
             max_force=limits.max_force_n,
             max_torque=limits.max_torque_nm,
             max_tension=limits.max_tension_n,

@@ -13,7 +13,8 @@ from dlo_gym.scene.builder import SceneConfig
 from sim2real.config import CellConfig
 
 SAMPLED = "sampled"
-ATTEMPTS = 20
+ATTEMPTS = 50
+WRIST_RESERVE = 2.0  # times the limit, that a goal keeps from the wrists' singularity
 
 
 def env_config(config: CellConfig) -> ShapeEnvConfig:
@@ -63,16 +64,29 @@ def _sampled(config: CellConfig, start: BoundaryPoses, seed: int) -> Array:
     scene = SceneConfig(cameras=config.camera_models, arms=config.dual_arm)
     cell = SimulatedCell(settings.properties, settings.n_elements, scene=scene)
     cell.reset(start)
-    rng, arms = np.random.default_rng(seed), config.dual_arm
+    rng, arms, bound = (
+        np.random.default_rng(seed),
+        config.dual_arm,
+        config.limits.min_wrist_angle_rad,
+    )
     for _ in range(ATTEMPTS):
         goal = sample_goal(cell, rng, settings)
-        clearance = arms.clearance(arms.inverse_kinematics(goal.boundary, cell.joint_angles))
-        if clearance.minimum > config.limits.min_arm_clearance_m:
+        joint_angles = arms.inverse_kinematics(goal.boundary, cell.joint_angles)
+        clear = arms.clearance(joint_angles).minimum > config.limits.min_arm_clearance_m
+        if clear and _wrist_angle(joint_angles, cell.joint_angles) > WRIST_RESERVE * bound:
             return goal.centerline
     raise ValueError(
         f"goal: none of {ATTEMPTS} sampled goals leaves the arms"
-        f" {config.limits.min_arm_clearance_m} m of clearance (limits.min_arm_clearance_m)"
+        f" {config.limits.min_arm_clearance_m} m of clearance (limits.min_arm_clearance_m) and the"
+        f" wrists {WRIST_RESERVE * bound:.3g} rad from their singularity"
     )
+
+
+def _wrist_angle(joint_angles: Array, now: Array) -> float:
+    """The smaller of both wrists' angles from their singularity [rad], negative beyond it, of
+    joint angles (2, 6) that the arms go to from ``now``."""
+    sides = np.sign(np.sin(now[:, 4]))
+    return float((sides * np.arcsin(np.sin(joint_angles[:, 4]))).min())
 
 
 def _from_file(file: Path, config: CellConfig) -> Array:

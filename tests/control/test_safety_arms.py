@@ -140,6 +140,20 @@ def test_a_command_out_of_reach_stops_where_reach_ends():
     assert gate.check(outwards.scaled(-0.2), boundary, q).reasons == ()
 
 
+def test_a_wrist_stays_out_of_its_singularity():
+    gate, q = SafetyGate(replace(WIDE, min_wrist_angle=0.1), ARMS), ARMS.home.copy()
+    sides, boundary, reasons = np.sign(np.sin(q[:, 4])), held(q), set()
+    for _ in range(30):  # turns that take both wrists to zero and beyond
+        turns = [sign * 0.05 * clamp[:3, 1] for sign, clamp in zip((1, -1), boundary.clamps)]
+        step = np.concatenate([[0, 0, 0, *turn] for turn in turns])
+        decision = gate.check(BoundaryDisplacement.from_vector(step), boundary, q)
+        boundary = decision.target
+        q = ARMS.inverse_kinematics(boundary, q)
+        reasons |= set(decision.reasons)
+        assert (sides * q[:, 4]).min() > 0.1 - 1e-6
+    assert "singularity" in reasons
+
+
 def pressed_together(clearance: float) -> SafetyLimits:
     return replace(WIDE, min_arm_clearance=clearance)
 
