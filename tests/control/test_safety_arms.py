@@ -144,7 +144,9 @@ def test_a_wrist_stays_out_of_its_singularity():
     gate, q = SafetyGate(replace(WIDE, min_wrist_angle=0.1), ARMS), ARMS.home.copy()
     sides, boundary, reasons = np.sign(np.sin(q[:, 4])), held(q), set()
     for _ in range(30):  # turns that take both wrists to zero and beyond
-        turns = [sign * 0.05 * clamp[:3, 1] for sign, clamp in zip((1, -1), boundary.clamps)]
+        turns = [
+            sign * 0.05 * clamp[:3, 1] for sign, clamp in zip((1, -1), boundary.clamps, strict=True)
+        ]
         step = np.concatenate([[0, 0, 0, *turn] for turn in turns])
         decision = gate.check(BoundaryDisplacement.from_vector(step), boundary, q)
         boundary = decision.target
