@@ -1,5 +1,6 @@
 """The ``dlo`` command: one subcommand per job, imported only when asked for."""
 
+import os
 import sys
 from importlib import import_module
 from importlib.metadata import version
@@ -7,6 +8,7 @@ from importlib.metadata import version
 import tyro
 from rich.console import Console
 from rich.table import Table
+from threadpoolctl import threadpool_limits
 
 from dlo_gym.exceptions import DloError
 
@@ -60,6 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     module, function = COMMANDS[name][0].split(":")
     try:
         command = getattr(import_module(module), function)
+        _one_thread_for_blas()
         tyro.cli(command, prog=f"dlo {name}", args=rest)
     except (DloError, ValueError, OSError) as error:
         console.print(f"dlo {name}: {error}", style="red", highlight=False, markup=False)
@@ -69,6 +72,13 @@ def main(arguments: list[str] | None = None) -> int:
         console.print(f"dlo {name}: interrupted{said}", style="yellow", markup=False)
         return 130
     return 0
+
+
+def _one_thread_for_blas() -> None:
+    """NumPy's matrices are small here: more threads only wait for each other, and for a control
+    loop that shares its cores with two robots they wait too long."""
+    threadpool_limits(1, user_api="blas")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the processes it starts
 
 
 def _list(group: str) -> None:
