@@ -1,9 +1,5 @@
 """Every command of docs/calibration.md, run on the emulated cell as a reader would."""
 
-import re
-import shlex
-from pathlib import Path
-
 import pytest
 
 from dlo_gym import cli
@@ -13,17 +9,10 @@ from sim2real.emulator.emulated_cell import EmulatedCell
 from sim2real.emulator.world_config import WorldConfig
 from tests.sim2real.calibration_data import apart
 from tests.sim2real.emulated import NETWORK, PATIENCE, move_addresses
+from tests.sim2real.guide import commands
 
-GUIDE = Path(__file__).parents[2] / "docs" / "calibration.md"
 POSES = {"calibration": 10, "check": 6}  # by folder of samples; the guide takes more
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
-
-
-def commands() -> list[list[str]]:
-    """The guide's ``dlo`` commands, in order."""
-    blocks = re.findall(r"```sh\n(.*?)```", GUIDE.read_text(), re.S)
-    lines = [line.partition("#")[0].strip() for block in blocks for line in block.splitlines()]
-    return [shlex.split(line)[1:] for line in lines if line.startswith("dlo ")]
 
 
 def option(command, name):
@@ -52,7 +41,7 @@ def off_truth(cell, world):
 
 def test_every_command_of_the_guide_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    emulation = next(c for c in commands() if c[1] == "emulate")
+    emulation = next(c for c in commands("calibration.md") if c[1] == "emulate")
     world = WorldConfig(
         cameras=default_cameras(int(option(emulation, "--image-height")) / 1080),
         address=f"{NETWORK}.4",
@@ -60,7 +49,7 @@ def test_every_command_of_the_guide_runs(tmp_path, monkeypatch):
     ).behind(f"{NETWORK}.2", f"{NETWORK}.3")
     cell, done = tmp_path / "cell.toml", []
     with EmulatedCell(world) as emulated:
-        for command in commands():
+        for command in commands("calibration.md"):
             if command == emulation:
                 continue  # it is what stands around this block
             if "--collect" in command:
