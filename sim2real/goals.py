@@ -64,16 +64,13 @@ def _sampled(config: CellConfig, start: BoundaryPoses, seed: int) -> Array:
     scene = SceneConfig(cameras=config.camera_models, arms=config.dual_arm)
     cell = SimulatedCell(settings.properties, settings.n_elements, scene=scene)
     cell.reset(start)
-    rng, arms, bound = (
-        np.random.default_rng(seed),
-        config.dual_arm,
-        config.limits.min_wrist_angle_rad,
-    )
+    rng, arms = np.random.default_rng(seed), config.dual_arm
+    now, bound = arms.inverse_kinematics(start), config.limits.min_wrist_angle_rad
     for _ in range(ATTEMPTS):
         goal = sample_goal(cell, rng, settings)
-        joint_angles = arms.inverse_kinematics(goal.boundary, cell.joint_angles)
+        joint_angles = arms.inverse_kinematics(goal.boundary, now)
         clear = arms.clearance(joint_angles).minimum > config.limits.min_arm_clearance_m
-        if clear and _wrist_angle(joint_angles, cell.joint_angles) > WRIST_RESERVE * bound:
+        if clear and _wrist_angle(joint_angles, now) > WRIST_RESERVE * bound:
             return goal.centerline
     raise ValueError(
         f"goal: none of {ATTEMPTS} sampled goals leaves the arms"
