@@ -78,11 +78,16 @@ def capsule_axes(T_world_base: Array, joint_angles: Array) -> Array:
 
 
 def clearance(T_world_base: Array, joint_angles: Array) -> Clearance:
-    """Clearances of arms on bases (2, 4, 4) at joint angles (..., 2, 6) [rad]."""
+    """Clearances of arms on bases (2, 4, 4) at joint angles (..., 2, 6) [rad].
+
+    NaN of an arm whose joint angles are.
+    """
     axes = capsule_axes(T_world_base, joint_angles)
     axes = axes.reshape(-1, *axes.shape[-4:])
     between, table, within = np.empty(len(axes)), np.empty((len(axes), 2)), np.empty((len(axes), 2))
     kernels.clearances(axes, CAPSULE_RADII, _ABOVE_TABLE, _SELF_PAIRS, between, table, within)
+    unknown = np.isnan(axes).any(axis=(2, 3, 4))
+    table[unknown] = within[unknown] = between[unknown.any(axis=1)] = np.nan
     batch = joint_angles.shape[:-2]
     return Clearance(between.reshape(batch), table.reshape(*batch, 2), within.reshape(*batch, 2))
 

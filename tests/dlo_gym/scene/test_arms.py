@@ -7,7 +7,7 @@ from dlo_gym.exceptions import UnreachablePose
 from dlo_gym.geometry.se3 import exp_so3, pose
 from dlo_gym.rod.boundary import BoundaryPoses
 from dlo_gym.scene.arms import DualArm
-from dlo_gym.scene.clearance import segment_distances
+from dlo_gym.scene.clearance import clearance, segment_distances
 from dlo_gym.scene.ur5e import JOINT_LIMIT, ik_branches, link_frames, nearest_turn
 
 CLAMP_ALONG_X = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -167,3 +167,14 @@ def test_clearance_sees_an_arm_folded_into_itself():
     stretched = arms.home.copy()
     stretched[0] = [0.0, -np.pi / 2, 0.0, -np.pi / 2, 0.0, 0.0]
     assert arms.clearance(stretched).within_arm.min() > 0
+
+
+def test_clearance_of_an_arm_out_of_reach_is_not_known():
+    arms = DualArm()
+    q = np.stack([arms.home, arms.home])
+    q[1, 1] = np.nan
+    known, unknown = clearance(arms.T_world_base, q[0]), clearance(arms.T_world_base, q)
+    np.testing.assert_array_equal(unknown.to_table[0], known.to_table)
+    np.testing.assert_array_equal(unknown.to_table[1], [known.to_table[0], np.nan])
+    np.testing.assert_array_equal(unknown.within_arm[1], [known.within_arm[0], np.nan])
+    assert np.isnan(unknown.between_arms).tolist() == [False, True]
