@@ -86,8 +86,9 @@ def clearance(T_world_base: Array, joint_angles: Array) -> Clearance:
     axes = axes.reshape(-1, *axes.shape[-4:])
     between, table, within = np.empty(len(axes)), np.empty((len(axes), 2)), np.empty((len(axes), 2))
     kernels.clearances(axes, CAPSULE_RADII, _ABOVE_TABLE, _SELF_PAIRS, between, table, within)
-    unknown = np.isnan(axes).any(axis=(2, 3, 4))
-    table[unknown] = within[unknown] = between[unknown.any(axis=1)] = np.nan
+    unknown = np.isnan(joint_angles).any(axis=-1).reshape(-1, 2)
+    table[unknown] = within[unknown] = np.nan
+    between[unknown[:, 0] | unknown[:, 1]] = np.nan
     batch = joint_angles.shape[:-2]
     return Clearance(between.reshape(batch), table.reshape(*batch, 2), within.reshape(*batch, 2))
 
