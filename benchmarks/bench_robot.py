@@ -30,8 +30,9 @@ def main() -> None:
         processes = {name: psutil.Process(pid) for name, pid in emulation.pids.items()}
         processes["left client"] = psutil.Process(cell.arms["left"].client_pid)  # type: ignore[attr-defined]
         processes["loop"] = psutil.Process()
+        home = cell.commanded
         for seed in range(EPISODES):
-            goal = make_goal("sampled", config, cell.commanded, seed)
+            goal = make_goal("sampled", config, home, seed)
             loop = ClosedLoop(config, goal)
             cell.refresh()
             for process in processes.values():
