@@ -13,7 +13,7 @@ from dlo_gym.geometry.se3 import Array, exp_so3
 from dlo_gym.rod.boundary import BoundaryPoses
 from dlo_gym.scene.arms import SIDES, DualArm
 from dlo_gym.scene.clearance import clearance
-from dlo_gym.scene.ur5e import nearest_solution
+from dlo_gym.scene.ur5e import nearest_solution, wrist_angle
 
 # A step is looked at in this many points of its way, then in as many more before the first of
 # them that breaks a limit.
@@ -74,7 +74,7 @@ class ArmSteps:
     ) -> None:
         self.limits, self.arms, self.clamps = limits, arms, clamps
         self.guess, self.former = joint_angles, former
-        self.wrist_sides = np.sign(np.sin(joint_angles[:, 4]))
+        self.wrist_sides = np.sign(wrist_angle(joint_angles))
         self._stands = False
 
     def cut(self, step: Array, allowed: AllowedSteps) -> Followed:
@@ -162,7 +162,7 @@ class ArmSteps:
     def _margins(self, joint_angles: Array) -> Array:
         """(m, 7) clearances [m] of joint angles (m, 2, 6), and how far either wrist is from its
         singularity [rad], negative on the other side of it."""
-        wrists = self.wrist_sides * np.arcsin(np.sin(joint_angles[:, :, 4]))
+        wrists = self.wrist_sides * wrist_angle(joint_angles)
         return np.concatenate([clearances(self.arms, joint_angles), wrists], axis=1)
 
     def _rates(self, joint_angles: Array) -> Array:

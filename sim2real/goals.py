@@ -10,6 +10,7 @@ from dlo_gym.envs.tasks import sample_goal
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryPoses
 from dlo_gym.scene.builder import SceneConfig
+from dlo_gym.scene.ur5e import wrist_angle
 from sim2real.config import CellConfig
 
 SAMPLED = "sampled"
@@ -70,20 +71,14 @@ def _sampled(config: CellConfig, start: BoundaryPoses, seed: int) -> Array:
         goal = sample_goal(cell, rng, settings)
         joint_angles = arms.inverse_kinematics(goal.boundary, now)
         clear = arms.clearance(joint_angles).minimum > config.limits.min_arm_clearance_m
-        if clear and _wrist_angle(joint_angles, now) > WRIST_RESERVE * bound:
+        wrists = np.sign(wrist_angle(now)) * wrist_angle(joint_angles)  # negative: beyond it
+        if clear and wrists.min() > WRIST_RESERVE * bound:
             return goal.centerline
     raise ValueError(
         f"goal: none of {ATTEMPTS} sampled goals leaves the arms"
         f" {config.limits.min_arm_clearance_m} m of clearance (limits.min_arm_clearance_m) and the"
         f" wrists {WRIST_RESERVE * bound:.3g} rad from their singularity"
     )
-
-
-def _wrist_angle(joint_angles: Array, now: Array) -> float:
-    """The smaller of both wrists' angles from their singularity [rad], negative beyond it, of
-    joint angles (2, 6) that the arms go to from ``now``."""
-    sides = np.sign(np.sin(now[:, 4]))
-    return float((sides * np.arcsin(np.sin(joint_angles[:, 4]))).min())
 
 
 def _from_file(file: Path, config: CellConfig) -> Array:

@@ -71,6 +71,12 @@ def nearest_solution(T_base_flange: ArrayLike, guess: ArrayLike) -> Array:
     return joint_angles
 
 
+def wrist_angle(joint_angles: Array) -> Array:
+    """Angle (...) [rad] from the wrist's singularity at joint angles (..., 6): 0 where the fourth
+    and the sixth axis fall together, its sign that of the side."""
+    return np.arcsin(np.sin(joint_angles[..., 4]))
+
+
 def why_unreachable(T_base_flange: Array) -> str:
     """The distance that puts a flange pose (4, 4) out of reach, in words."""
     wrist = T_base_flange[:3, 3] - DH_D[5] * T_base_flange[:3, 2]
