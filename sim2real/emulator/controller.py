@@ -9,7 +9,6 @@ import math
 import time
 from collections import deque
 from dataclasses import dataclass, field
-from enum import IntEnum
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +16,7 @@ import numpy as np
 from sim2real.emulator import kinematics
 from sim2real.emulator.fields import Inputs, OutputImage
 from sim2real.emulator.kinematics import Array
+from sim2real.emulator.modes import RobotMode, Runtime, Safety
 from sim2real.emulator.motion import (
     JOINT_LIMIT,
     TICK,
@@ -26,57 +26,12 @@ from sim2real.emulator.motion import (
     MotionLimits,
     PausedMotion,
 )
+from sim2real.emulator.power import Power
+from sim2real.emulator.report import Flags, Report
 
 _log = logging.getLogger(__name__)
 
-_JOINT_RUNNING, _JOINT_OFF, _JOINT_IDLE = 253, 239, 238
 _HISTORY = 500  # ticks of joint angles kept for get_actual_joint_positions_history
-
-# Fields of floats that change now and then.
-_WRITTEN = (
-    *("timestamp", "actual_TCP_pose", "actual_TCP_speed", "payload", "payload_cog", "tcp_offset"),
-    *("standard_analog_output0", "standard_analog_output1"),
-    *("target_speed_fraction", "speed_scaling"),
-)
-
-
-class RobotMode(IntEnum):
-    """RTDE robot_mode."""
-
-    BOOTING = 2
-    POWER_OFF = 3
-    POWER_ON = 4
-    IDLE = 5
-    RUNNING = 7
-
-
-class Safety(IntEnum):
-    """RTDE safety_mode, of which the emulator has these."""
-
-    NORMAL = 1
-    REDUCED = 2
-    PROTECTIVE_STOP = 3
-    SAFEGUARD_STOP = 5
-    ROBOT_EMERGENCY_STOP = 7
-
-
-class Runtime(IntEnum):
-    """RTDE runtime_state."""
-
-    STOPPED = 1
-    PLAYING = 2
-    PAUSED = 4
-
-
-# Bits of safety_status_bits: 0 normal, 1 reduced, 2 protective, 4 safeguard, 6 robot emergency,
-# 7 any emergency, 10 stopped due to safety.
-_SAFETY_BITS = {
-    Safety.NORMAL: 1 << 0,
-    Safety.REDUCED: 1 << 1,
-    Safety.PROTECTIVE_STOP: 1 << 2 | 1 << 10,
-    Safety.SAFEGUARD_STOP: 1 << 4 | 1 << 10,
-    Safety.ROBOT_EMERGENCY_STOP: 1 << 6 | 1 << 7 | 1 << 10,
-}
 
 
 class Program(Protocol):
@@ -132,7 +87,7 @@ class Controller:
     Attributes:
         motion: the arm.
         inputs: what clients write.
-        image: what clients receive.
+        power: of the arm.
         wrench: (6,) that the world exerts at the TCP, base axes [N], [N m].
         popups, log: texts the robot shows and has logged, newest last.
     """
@@ -143,13 +98,12 @@ class Controller:
         self.options = options or ControllerOptions()
         self.motion = Motion(joint_angles, kinematics.transform(tcp), self.options.limits)
         self.inputs = Inputs()
-        self.image = OutputImage()
+        self.power = Power(self.options.power_delay)
         self.tcp = np.array(tcp, dtype=np.float64)
         self.wrench = np.zeros(6)
         self.wrench_zero = np.zeros(6)
         self.payload = 0.0
         self.payload_cog = np.zeros(3)
-        self.robot_mode = RobotMode.RUNNING
         self.safety = Safety.NORMAL
         self.runtime = Runtime.STOPPED
         self.remote = self.options.remote
@@ -164,16 +118,20 @@ class Controller:
         self.waypoint = np.zeros(6)  # TCP pose vector of the newest move
         self.ticks = 0
         self._stopped_at = -math.inf
-        self._power_goal = RobotMode.RUNNING
-        self._power_changes_at: tuple[float, RobotMode] | None = None
         self._paused: PausedMotion | None = None
         self._history: deque[list[float]] = deque(maxlen=_HISTORY)
-        self._flags: tuple[float, ...] = ()
-        self._live = self.image.live()
-        self._force_squared = 0.0
-        self._views = {name: self.image.view(name) for name in _WRITTEN}
-        self._write_constants()
+        self._report = Report()
+        self._report.set_tcp(self.tcp)
         self._write_fields()
+
+    @property
+    def image(self) -> OutputImage:
+        """What clients receive."""
+        return self._report.image
+
+    @property
+    def robot_mode(self) -> RobotMode:
+        return self.power.mode
 
     @property
     def robot_time(self) -> float:
@@ -190,8 +148,7 @@ class Controller:
         """Advance the robot by 2 ms."""
         self.ticks += 1
         now = time.monotonic()
-        if self._power_changes_at is not None and now >= self._power_changes_at[0]:
-            self._next_power_mode(now)
+        self.power.tick(now)
         if self.watchdog is not None:
             self._check_watchdog(self.watchdog, now)
         try:
@@ -201,15 +158,14 @@ class Controller:
             self.motion.step()
         except MotionFault as fault:
             self.protective_stop(str(fault))
-        self._write_fields()
-        if self._force_squared > self.options.force_limit**2:
+        if self._write_fields() > self.options.force_limit**2:
             self.protective_stop("the force at the tool is above its limit")
 
     # Safety
 
     def protective_stop(self, reason: str) -> None:
         """Stop the arm and pause the program; nothing while it is stopped already."""
-        if self.safety is not Safety.NORMAL or self.robot_mode is not RobotMode.RUNNING:
+        if self.safety is not Safety.NORMAL or not self.power.running:
             return
         self.note(f"protective stop: {reason}")
         self.stop_reason = reason
@@ -235,8 +191,7 @@ class Controller:
         self.stop_reason = "emergency stop"
         self.safety = Safety.ROBOT_EMERGENCY_STOP
         self.stop_program("emergency stop")
-        self._power_changes_at = None
-        self.robot_mode = RobotMode.POWER_OFF
+        self.power.off()
 
     def release_emergency_stop(self) -> None:
         """The button is pulled out; power stays off until it is asked for."""
@@ -250,37 +205,21 @@ class Controller:
         """Power the arm up, to idle or with free brakes; False in an emergency stop."""
         if self.safety is Safety.ROBOT_EMERGENCY_STOP:
             return False
-        goal = RobotMode.RUNNING if release_brakes else RobotMode.IDLE
-        if self.robot_mode < goal:
-            self._power_goal = goal
-            delay = self.options.power_delay
-            if self.robot_mode is RobotMode.POWER_OFF:
-                self.robot_mode = RobotMode.POWER_ON
-                self._power_changes_at = time.monotonic() + delay, RobotMode.IDLE
-            elif self.robot_mode is RobotMode.IDLE:
-                self._power_changes_at = time.monotonic() + delay, RobotMode.RUNNING
+        self.power.on(time.monotonic(), release_brakes=release_brakes)
         return True
 
     def power_off(self) -> None:
         """Stop everything and take the arm's power."""
         self.stop_program("power off")
         self.motion.hold()
-        self._power_changes_at = None
-        self.robot_mode = RobotMode.POWER_OFF
-
-    def _next_power_mode(self, now: float) -> None:
-        assert self._power_changes_at is not None
-        self.robot_mode = self._power_changes_at[1]
-        self._power_changes_at = None
-        if self.robot_mode is RobotMode.IDLE and self._power_goal is RobotMode.RUNNING:
-            self._power_changes_at = now + self.options.power_delay, RobotMode.RUNNING
+        self.power.off()
 
     # Programs
 
     @property
     def ready(self) -> bool:
         """Whether a program could run."""
-        return self.robot_mode is RobotMode.RUNNING and self.safety is Safety.NORMAL
+        return self.power.running and self.safety is Safety.NORMAL
 
     def start_program(self, program: Program) -> bool:
         """Run a program instead of the present one; False if the robot cannot."""
@@ -353,12 +292,12 @@ class Controller:
         """Set the tool centre point, a pose vector (6,) on the flange."""
         self.tcp = np.array(tcp, dtype=np.float64)
         self.motion.T_flange_tcp = kinematics.transform(self.tcp)
-        self._views["tcp_offset"][:] = self.tcp
+        self._report.set_tcp(self.tcp)
 
     def set_payload(self, mass: float, cog: Array) -> None:
         """Set the payload [kg] and its centre of gravity (3,) [m] on the flange."""
         self.payload, self.payload_cog = mass, np.array(cog, dtype=np.float64)
-        self._views["payload"][0], self._views["payload_cog"][:] = mass, self.payload_cog
+        self._report.set_payload(mass, self.payload_cog)
 
     def set_outputs(self, written: dict[str, tuple[float | int, ...]]) -> None:
         """Apply what a client wrote into fields that are no registers."""
@@ -398,8 +337,8 @@ class Controller:
             "joint_velocities": self.motion.qd.tolist(),
             "target": self.motion.target.tolist(),
             "motion": self.motion.mode.value,
-            "tcp_pose": self._views["actual_TCP_pose"].tolist(),
-            "tcp_speed": self._views["actual_TCP_speed"].tolist(),
+            "tcp_pose": self._report.tcp_pose.tolist(),
+            "tcp_speed": self._report.tcp_speed.tolist(),
             "tcp_offset": self.tcp.tolist(),
             "wrench": self.wrench.tolist(),
             "safety": names.get(self.safety, self.safety.name.lower()),
@@ -416,53 +355,20 @@ class Controller:
             "stamp": time.monotonic(),
         }
 
-    # What is sent
-
-    def _write_constants(self) -> None:
-        image = self.image
-        image.view("actual_main_voltage")[:] = 48.0
-        image.view("actual_robot_voltage")[:] = 48.0
-        image.view("actual_joint_voltage")[:] = 48.0
-        image.view("joint_temperatures")[:] = 28.0
-        image.view("actual_tool_accelerometer")[2] = 9.81
-        self._views["tcp_offset"][:] = self.tcp
-
-    def _write_fields(self) -> None:
-        views, motion = self._views, self.motion
-        views["timestamp"][0] = self.ticks * TICK
-        self._force_squared = kinematics.report(
-            *(motion.q, motion.qd, motion.qdd, motion.T_flange_tcp),
-            *(self.wrench, self.wrench_zero, self._live),
+    def _write_fields(self) -> float:
+        """Write what clients receive; returns the squared force at the tool [N^2]."""
+        self._history.append(self.motion.q.tolist())
+        flags = Flags(
+            self.power.mode,
+            self.safety,
+            self.runtime,
+            self.digital_outputs,
+            (self.analog_outputs[0], self.analog_outputs[1]),
+            self.motion.speed_slider,
         )
-        self._history.append(motion.q.tolist())
-        self._write_flags()
-        self.image.renew()
-
-    def _write_flags(self) -> None:
-        """Write what seldom changes, when it has."""
-        slider = self.motion.speed_slider
-        flags = (
-            *(self.robot_mode, self.safety, self.runtime, self.digital_outputs),
-            *(slider, *self.analog_outputs),
+        return self._report.write(
+            self.robot_time, self.motion, self.wrench, self.wrench_zero, flags
         )
-        if flags == self._flags:
-            return
-        self._flags = flags
-        image, views, mode = self.image, self._views, self.robot_mode
-        views["standard_analog_output0"][0] = self.analog_outputs[0]
-        views["standard_analog_output1"][0] = self.analog_outputs[1]
-        views["target_speed_fraction"][0] = slider
-        views["speed_scaling"][0] = slider if self.runtime is Runtime.PLAYING else 0.0
-        joints = {RobotMode.RUNNING: _JOINT_RUNNING, RobotMode.IDLE: _JOINT_IDLE}
-        image.set_integer("robot_mode", mode)
-        image.set_integer("joint_mode", *[joints.get(mode, _JOINT_OFF)] * 6)
-        image.set_integer("safety_mode", self.safety)
-        image.set_integer("safety_status", self.safety)
-        image.set_integer("safety_status_bits", _SAFETY_BITS[self.safety])
-        image.set_integer("runtime_state", self.runtime)
-        powered = mode is not RobotMode.POWER_OFF
-        image.set_integer("robot_status_bits", powered | (self.runtime is Runtime.PLAYING) << 1)
-        image.set_integer("actual_digital_output_bits", self.digital_outputs)
 
     def teleport(self, joint_angles: Array) -> None:
         """Put the arm elsewhere at once, (6,) [rad].

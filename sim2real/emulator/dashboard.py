@@ -6,7 +6,8 @@ Source: Universal Robots, "Dashboard Server e-Series"; wording as clients look f
 from collections.abc import Callable
 
 from sim2real.emulator.connections import LineConnection, Listener
-from sim2real.emulator.controller import Controller, Runtime, Safety
+from sim2real.emulator.controller import Controller
+from sim2real.emulator.modes import Runtime, Safety
 
 DASHBOARD_PORT = 29999
 _GREETING = b"Connected: Universal Robots Dashboard Server\n"
