@@ -3,8 +3,12 @@
 # MuJoCo ships no type information.
 # pyright: reportAttributeAccessIssue=false
 
+import ctypes
+import importlib.util
 import os
+import sys
 import weakref
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
@@ -110,6 +114,7 @@ class OpenGlCanvas:
 def _open_context(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
     """A current OpenGL context of MUJOCO_GL's kind (EGL if unset) with the model's data in it."""
     backend = os.environ.setdefault("MUJOCO_GL", "egl").lower()
+    _load_triton()
     try:
         if backend == "egl":
             from mujoco.egl import GLContext
@@ -125,6 +130,18 @@ def _open_context(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
             "  apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
         ) from error
     return gl, context
+
+
+def _load_triton() -> None:
+    """Load the library of triton, which comes with torch's CUDA build, ahead of Mesa's.
+
+    Both hold an LLVM of their own, and loaded after Mesa's, triton's takes the other for its own
+    and crashes when an optimiser imports it.
+    """
+    spec = importlib.util.find_spec("triton")
+    if spec is not None and spec.origin is not None and "triton" not in sys.modules:
+        for library in Path(spec.origin).parent.glob("_C/libtriton*.so"):
+            ctypes.CDLL(str(library))
 
 
 def _free_context(gl: Any, context: mujoco.MjrContext) -> None:

@@ -1,6 +1,9 @@
 """What the cameras see, against what the camera model says they must see."""
 
+import subprocess
+import sys
 from dataclasses import replace
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -249,6 +252,18 @@ def test_a_missing_egl_names_the_packages(monkeypatch):
         scene.update(*hanging())
         with pytest.raises(RenderingUnavailable, match="libegl1 libegl-mesa0 libgl1-mesa-dri"):
             scene.render("side")
+
+
+@pytest.mark.skipif(find_spec("triton") is None, reason="comes with torch's CUDA build alone")
+def test_triton_can_be_imported_after_rendering():
+    script = (
+        "import mujoco\n"
+        "from dlo_gym.scene.opengl_canvas import OpenGlCanvas\n"
+        "OpenGlCanvas(mujoco.MjModel.from_xml_string('<mujoco/>'), shadows=False)\n"
+        "import triton\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
 
 
 def test_an_unreachable_clamp_moves_nothing(plain):
