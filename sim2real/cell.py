@@ -16,7 +16,9 @@ from dlo_gym.rod.boundary import BoundaryPoses
 from dlo_gym.scene.arms import SIDES, T_CLAMP_TCP
 from dlo_gym.scene.ur5e import link_frames
 from sim2real.arm import Arm, SimulatedArm
-from sim2real.cameras.camera import Camera, CameraSettings, make_camera, synchronised
+from sim2real.cameras.camera import Camera, CameraSettings
+from sim2real.cameras.drivers import make_camera
+from sim2real.cameras.synchronisation import synchronised
 from sim2real.config import CellConfig
 from sim2real.pose_history import interpolate_poses
 from sim2real.ur5e.handle import UR5eArm

@@ -17,13 +17,15 @@ from dlo_gym.rod.boundary import BoundaryPoses
 from dlo_gym.scene.builder import default_cameras
 from dlo_gym.scene.renderer import SceneRenderer
 from sim2real.cameras import frame_buffer, opencv_camera
-from sim2real.cameras.camera import CameraSettings, Frame, make_camera, newest_match, synchronised
+from sim2real.cameras.camera import CameraSettings, Frame
 from sim2real.cameras.capture import DamagedImageError, Shot, StreamCamera
+from sim2real.cameras.drivers import make_camera
 from sim2real.cameras.frame_buffer import FrameBuffer
 from sim2real.cameras.mjpeg_camera import MjpegCamera
 from sim2real.cameras.oak_camera import OakCamera, shot_of_packet
 from sim2real.cameras.opencv_camera import OpenCVCamera, device_kind
 from sim2real.cameras.rendered_camera import RenderedCamera
+from sim2real.cameras.synchronisation import newest_match, synchronised
 
 MODEL = CameraModel.looking_at("top", (0, 0, 1), (0, 0, 0), up=(0, 1, 0), width=32, height=24)
 IMAGE = np.zeros((24, 32, 3), np.uint8)
