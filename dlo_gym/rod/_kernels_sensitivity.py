@@ -4,8 +4,8 @@ A stage ends where its potential's gradient vanishes, so with H its Hessian ther
 
     H d(unknowns) = -(d(gradient)/d(parameters) + d(gradient)/d(b, c) d(b, c) + ... d(clamps))
 
-for every column, be it a parameter, a clamp's motion or a change of the initial state. All else in a
-step (``_kernels_dynamics``) is explicit and differentiated as it stands.
+for every column, be it a parameter, a clamp's motion or a change of the initial state. All else in
+a step (``_kernels_dynamics``) is explicit and differentiated as it stands.
 """
 
 from math import cos, sin, sqrt
@@ -218,7 +218,7 @@ def _differentiate_stage(
     base, d_base, stage, rod = scratch.base, carried.base, scratch.stage, system.rod
     geometry, columns, codes = carried.geometry, carried.columns, carried.codes
     ends = Ends(carried.frames, right_held)
-    n, m = moment.q.shape[0], codes.shape[0]
+    n = moment.q.shape[0]
     x = moment.places[: n + 1]
     first, last = free_range(n, right_held)
     length = rod.rest_length.sum()
@@ -339,7 +339,7 @@ def _differentiate_trapezoid_base(
     """Update ``scratch.base`` and its change to b = y + s v and c = v + s a(y)."""
     before, base, d_before, d_base = scratch.before, scratch.base, carried.before, carried.base
     geometry, codes = carried.geometry, carried.codes
-    n, m = before.q.shape[0], codes.shape[0]
+    m = codes.shape[0]
     ends = Ends(carried.frames, right_held)
     _move_clamps(path, time, right_held, carried, d_before)
     measure(system.rod, before.places, before.q, ends, geometry)
@@ -430,7 +430,7 @@ def _add_energy_change(system, motion, sign, moment, tangent, ends, carried, wor
     for c in range(m):
         code = codes[c]
         total = mass_change(code, length) * kinetic
-        if code == LENGTH or code == LOG_WEIGHT:
+        if code in (LENGTH, LOG_WEIGHT):
             share = 1.0 if code == LOG_WEIGHT else 1.0 / length
             for i in range(n + 1):
                 for k in range(3):
