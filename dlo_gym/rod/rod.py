@@ -130,7 +130,8 @@ class CosseratRod:
         Raises:
             ValueError: if the clamps are further apart than the rod is long, or one is inside an
                 obstacle.
-            RodDiverged: if no equilibrium was found; the rod keeps its former state.
+            RodDiverged: if no equilibrium was found; the rod keeps its former state, which is the
+                error's ``last_good``: None the first time.
         """
         self._check_boundary(boundary, self._contact.obstacles)
         if start is None:

@@ -219,20 +219,6 @@ def test_held_nodes_have_the_clamps_velocity():
     assert abs(state.time - 0.1) < 1e-15
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"duration": 0.1, "dt": 0.0}, "dt: expected a positive"),
-        ({"duration": -0.1, "dt": 0.01}, "duration: expected a positive"),
-        ({"duration": 0.1, "dt": 0.01, "order": 3}, "order: expected 1 or 2, got 3"),
-        ({"duration": 0.1, "dt": 0.01, "tolerance": 0.0}, "tolerance"),
-    ],
-)
-def test_impossible_steps_are_named(options, message):
-    with pytest.raises(ValueError, match=message):
-        swung(0, RodProperties(LENGTH)).advance(BOTH_STILL, **options)
-
-
 def test_lost_motion_restores_the_state(monkeypatch):
     rod = swung(1, RodProperties(LENGTH))
     before = rod.state
