@@ -11,7 +11,8 @@ class RodDiverged(DloError):
     """The rod solver found no trustworthy equilibrium.
 
     Attributes:
-        last_good: the ``RodState`` before the request, to which the rod has been restored.
+        last_good: the ``RodState`` before the request, to which the rod has been restored; None
+            only where it had none, because it had never settled.
     """
 
     def __init__(self, message: str, last_good: Any = None) -> None:

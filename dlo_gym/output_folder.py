@@ -36,6 +36,16 @@ def check_output_folder(out: Path, made: Iterable[str], *, overwrite: bool) -> N
         raise FileExistsError(f"{out} exists; pass --overwrite to replace it")
 
 
+def check_resume(resume: bool, overwrite: bool) -> None:
+    """Refuse a command that is to go on with what it finds and to throw it away.
+
+    Raises:
+        ValueError: naming both options.
+    """
+    if resume and overwrite:
+        raise ValueError("resume, overwrite: expected at most one of them, got both")
+
+
 def replace_folder(finished: Path, out: Path) -> None:
     """Give the folder ``finished`` the name ``out``; a former ``out`` goes when that has worked."""
     former = out.with_name(f".{out.name}.former-{os.getpid()}")

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from benchmarks.validation import buckling, dynamics, engines, page, statics
+from benchmarks.validation import buckling, contact, dynamics, engines, page, statics
 from benchmarks.validation.case import Case
 
 CASES: dict[str, Callable[[], Case]] = {
@@ -16,6 +16,8 @@ CASES: dict[str, Callable[[], Case]] = {
     "euler": buckling.euler_case,
     "ring": buckling.ring_case,
     "helix": buckling.helix_case,
+    "incline": contact.incline_case,
+    "capstan": contact.capstan_case,
     "engines": engines.engines_case,
     "waves": dynamics.waves_case,
     "time-steps": dynamics.time_steps_case,

@@ -345,7 +345,7 @@ def gaps(touch, obstacles, x, out):
 @njit(cache=True)
 def free_fraction(touch, before, after, x, x_after, depth):
     """The part of the way from ``x`` to ``x_after`` that takes no point deeper than ``depth``
-    radii into an obstacle, or deeper than it was by that.
+    radii into an obstacle or, by more than a tenth of that, deeper than it was.
 
     Obstacles go from poses ``before`` to ``after`` on the way, and a point's way is straight in
     the obstacle's frame. Conservative advancement: a point moves by what its distance allows.
@@ -376,7 +376,7 @@ def free_fraction(touch, before, after, x, x_after, depth):
             way = sqrt(way)
             radius = touch.radius[i]
             gap = local_distance(kind, size, start) - radius
-            floor = min(gap, 0.0) - depth * radius
+            floor = min(gap, -depth * radius) - 0.1 * depth * radius
             if gap - way >= floor:
                 continue
             t = 0.0

@@ -126,6 +126,14 @@ def _free(contact, x, step):
 
 
 @njit(cache=True)
+def step_within_reach(system, x, q, ends, contact, step, work):
+    """Update the shape by as much of ``step`` (n_dofs, 1) as goes through nothing, and
+    ``work.stress`` to that of the new shape."""
+    apply_step(system.rod, x, q, step[:, 0], _free(contact, x, step), work.stress)
+    exact_stress(system.rod, x, q, work.stress)
+
+
+@njit(cache=True)
 def predict(system, x, q, ends, contact, twist, clamp_rotations, work, matrix, remote):
     """Take the linearised rod's answer to a ``twist`` (12,) of the clamps, from the factors at the
     present state; BLOCKED, and no step, if it would go through something."""

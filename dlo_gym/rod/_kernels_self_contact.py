@@ -104,7 +104,7 @@ def free_fraction_of_pairs(touch, x, x_after, depth):
         bound = sqrt(max(speed[0], speed[1])) + sqrt(max(speed[2], speed[3]))
         apart = touch.pair_radius[e] + touch.pair_radius[f]
         gap = segment_distance(at[0], at[1], at[2], at[3])[0] - apart
-        floor = min(gap, 0.0) - depth * apart
+        floor = min(gap, -depth * apart) - 0.1 * depth * apart
         t = 0.0
         while t * bound < fraction * bound:
             t += max(gap - floor, 0.01 * depth * apart) / bound

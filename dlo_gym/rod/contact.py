@@ -35,6 +35,8 @@ DEEPEST = 0.5  # of the radius: more overlap is not believed
 DESCENT = 200  # steps of descent in a move, before a shorter one is tried
 ROUGH = 1e6  # of the tolerance: where descent first gives way to Newton's method
 CLAMP_DEPTH = 0.05  # of the radius: what the rod may overlap at a clamp
+INVERSE_ITERATIONS = 12
+AWAY_FROM_SADDLE = tuple(0.3 * 0.25**k for k in range(9))  # turns of an element, tried [rad]
 NO_LAG = np.zeros((0, 0, 4))
 
 Shape = tuple[System, Array, Array, Ends]  # what the solver's kernels begin with
@@ -176,10 +178,38 @@ class ContactModel:
             if status == CONVERGED:
                 if self.linearise(shape, work)[1] == 0:
                     return CONVERGED, steps
+                if self._leave_saddle(shape, hold, work):
+                    rough = limits.residual  # Newton's method might go back
+                    continue
                 kick = True
             x[:], q[:], self.anchors[:] = near
             rough = max(limits.residual, 1e-2 * rough)
         return STALLED, steps
+
+    def _leave_saddle(self, shape: Shape, hold: Hold, work: Work) -> bool:
+        """Step to lower energy along the softest direction of the factorised tangent, found by
+        inverse iteration; whether there is such a step."""
+        system, x, q, ends = shape
+        contact = self._contact(hold)
+        point_kernels.update_lag(self.constants, self.arrays, x, hold.lag)
+        first, last = free_range(len(q), ends.right_held)
+        softest = np.zeros((len(self.matrix), 1))
+        softest[first:last, 0] = np.cos(1.0 + 0.7 * np.arange(first, last))
+        for _ in range(INVERSE_ITERATIONS):
+            pair_kernels.solve(self.matrix, self.remote, first, last, softest)
+            softest /= np.linalg.norm(softest)
+        turns = softest[:-3].reshape(-1, 6)[:, 3:]
+        softest /= max(np.linalg.norm(turns, axis=1).max(), 1e-300)
+        saddle = x.copy(), q.copy()
+        exact_stress(system.rod, x, q, work.stress)
+        energy, _ = kernels.evaluate(*shape, contact, work, self.matrix)
+        for turn in AWAY_FROM_SADDLE:
+            kernels.step_within_reach(*shape, contact, turn * softest, work)
+            lower, _ = kernels.evaluate(*shape, contact, work, self.matrix)
+            if lower < energy - 1e-13 * abs(energy):
+                return True
+            x[:], q[:] = saddle
+        return False
 
     def follow(
         self,
@@ -192,7 +222,7 @@ class ContactModel:
     ) -> tuple[int, float]:
         """Answer a ``twist`` (12,) of the clamps, and the obstacles' way to other poses if they
         move; returns a status and the potential [J]."""
-        _, x, _, _ = shape
+        _, x, q, _ = shape
         if obstacles is not None:
             if not self.place(x, x, obstacles):
                 return kernels.BLOCKED, 0.0
@@ -201,11 +231,13 @@ class ContactModel:
         status = kernels.predict(*shape, contact, twist, rotations, work, self.matrix, self.remote)
         if status == CONVERGED or (status == kernels.BLOCKED and not twist.any()):
             # Clamps that hold still leave the shape where it was; Newton's steps go no deeper.
+            predicted = x.copy(), q.copy()
             status, _ = kernels.newton(
                 *shape, contact, self._within_rounding(shape[0], limits), kernels.NEWTON_STEPS,
                 work, self.matrix,
             )  # fmt: skip
             if status == STALLED:
+                x[:], q[:] = predicted
                 status, _ = self.minimise(shape, limits, DESCENT, work)
         if status != CONVERGED:
             return status, 0.0

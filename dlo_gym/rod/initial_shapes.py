@@ -1,6 +1,7 @@
 """Shapes to start a rod from: straight, arc, catenary, hanging between clamps, random clamps."""
 
 from collections.abc import Callable
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -13,13 +14,27 @@ from dlo_gym.rod.boundary import BoundaryPoses
 
 
 def straight(clamp: ArrayLike, length: float, n_nodes: int) -> Array:
-    """Nodes (n_nodes, 3) [m] of a straight rod along d3 of the left ``clamp`` (4, 4)."""
+    """Nodes (n_nodes, 3) [m] of a straight rod along d3 of the left ``clamp`` (4, 4).
+
+    Raises:
+        ValueError: naming a length that is not positive or fewer than two nodes.
+    """
+    _check_curve(length, n_nodes)
     clamp = np.asarray(clamp, dtype=np.float64)
     return clamp[:3, 3] + np.linspace(0.0, length, n_nodes)[:, None] * clamp[:3, 2]
 
 
 def arc(clamp: ArrayLike, length: float, angle: float, n_nodes: int) -> Array:
-    """Nodes (n_nodes, 3) [m] of a circular arc that turns by ``angle`` [rad] about d1."""
+    """Nodes (n_nodes, 3) [m] of a circular arc that turns by ``angle`` [rad] about d1.
+
+    Raises:
+        ValueError: naming a length that is not positive, an angle of zero, fewer than two nodes.
+    """
+    _check_curve(length, n_nodes)
+    if not (isfinite(angle) and angle != 0.0):
+        raise ValueError(
+            f"angle: expected other than zero [rad], as ``straight`` has it; got {angle}"
+        )
     clamp = np.asarray(clamp, dtype=np.float64)
     turned = np.linspace(0.0, angle, n_nodes)
     radius = length / angle
@@ -36,6 +51,7 @@ def catenary(start: ArrayLike, end: ArrayLike, length: float, n_nodes: int) -> A
     Raises:
         ValueError: if the points are further apart than ``length`` or one above the other.
     """
+    _check_curve(length, n_nodes)
     start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     chord = end - start
     d, v = float(np.hypot(chord[0], chord[1])), float(chord[2])
@@ -60,6 +76,7 @@ def catenary(start: ArrayLike, end: ArrayLike, length: float, n_nodes: int) -> A
 def hanging(boundary: BoundaryPoses, length: float, n_nodes: int) -> Array:
     """Nodes (n_nodes, 3) [m] of a smooth curve of the given length that leaves both clamps along
     their d3 and sags between them: a start for the rod's own equilibrium."""
+    _check_curve(length, n_nodes)
     if boundary.right is None:
         return straight(boundary.left, length, n_nodes)
     p0, p3 = boundary.left[:3, 3], boundary.right[:3, 3]
@@ -93,6 +110,7 @@ def random_boundary(rng: np.random.Generator, length: float) -> BoundaryPoses:
     """Clamp poses as two arms may hold a cable of ``length`` [m]: 0.3 to 0.95 lengths apart, in
     any heading, up to 30 degrees out of level, each clamp tilted up to 60 degrees off the chord and
     twisted up to 30 degrees, around 0.35 m above the origin."""
+    _check_curve(length, 2)
     heading = rng.uniform(-np.pi, np.pi)
     slope = rng.uniform(-np.pi / 6, np.pi / 6)
     span = rng.uniform(0.3, 0.95) * length
@@ -108,6 +126,13 @@ def random_boundary(rng: np.random.Generator, length: float) -> BoundaryPoses:
         bend = exp_so3([tilt * np.cos(azimuth), tilt * np.sin(azimuth), 0.0])
         clamps.append(pose(level @ bend @ exp_so3([0.0, 0.0, twist]), centre + side * span * along))
     return BoundaryPoses(*clamps)
+
+
+def _check_curve(length: float, n_nodes: int) -> None:
+    if not (isfinite(length) and length > 0.0):
+        raise ValueError(f"length: expected a positive length [m], got {length}")
+    if n_nodes < 2:
+        raise ValueError(f"n_nodes: expected at least 2, got {n_nodes}")
 
 
 def _root(function: Callable[[float], float], low: float, high: float) -> float:

@@ -64,31 +64,37 @@ class RodProperties:
     relaxation_time: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (isfinite(self.length) and self.length > 0):
-            raise ValueError(f"length: expected a positive length [m], got {self.length}")
+        for name in ("length", "relaxation_time"):
+            value = getattr(self, name)
+            if not (_is_number(value) and value > 0.0):
+                unit = "length [m]" if name == "length" else "time [s]"
+                raise ValueError(f"{name}: expected a positive {unit}, got {value!r}")
         for name in PER_ELEMENT:
             if getattr(self, name) is None:
                 continue
-            values = np.asarray(getattr(self, name), dtype=np.float64)
+            values = _numbers(getattr(self, name))
             if values.ndim > 1 or not np.isfinite(values).all() or not (values > 0).all():
                 raise ValueError(
-                    f"{name}: expected a positive number or one per element, got {values}"
+                    f"{name}: expected a positive number or one per element,"
+                    f" got {getattr(self, name)!r}"
                 )
             object.__setattr__(self, name, values if values.ndim else float(values))
-        if not -1.0 < self.poisson_ratio <= 0.5:
-            raise ValueError(f"poisson_ratio: expected -1 < nu <= 0.5, got {self.poisson_ratio}")
+        if not (_is_number(self.poisson_ratio) and -1.0 < self.poisson_ratio <= 0.5):
+            raise ValueError(f"poisson_ratio: expected -1 < nu <= 0.5, got {self.poisson_ratio!r}")
         for name in ("external_damping", "internal_damping"):
             value = getattr(self, name)
-            if not (isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name}: expected zero or a positive number, got {value}")
+            if not (_is_number(value) and value >= 0.0):
+                raise ValueError(f"{name}: expected zero or a positive number, got {value!r}")
         for name in ("hardening", "creep"):
-            if not 0.0 <= getattr(self, name) < 1.0:
-                raise ValueError(f"{name}: expected 0 <= {name} < 1, got {getattr(self, name)}")
-        if not (isfinite(self.relaxation_time) and self.relaxation_time > 0.0):
+            value = getattr(self, name)
+            if not (_is_number(value) and 0.0 <= value < 1.0):
+                raise ValueError(f"{name}: expected 0 <= {name} < 1, got {value!r}")
+        if self.hardening > 0.0 and self.yield_curvature is None:
             raise ValueError(
-                f"relaxation_time: expected a positive time [s], got {self.relaxation_time}"
+                "hardening: expected with a yield_curvature only, beyond which it acts,"
+                f" got {self.hardening} and None"
             )
-        rest = np.asarray(self.rest_curvature, dtype=np.float64)
+        rest = _numbers(self.rest_curvature)
         if rest.shape[-1:] != (3,) or rest.ndim > 2 or not np.isfinite(rest).all():
             raise ValueError(
                 "rest_curvature: expected finite values of shape (3,) or (n_elements - 1, 3),"
@@ -161,6 +167,18 @@ class RodProperties:
         if self.mass_per_length is not None:
             return self.mass_per_length
         return self.density * self.area
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float | np.number) and isfinite(value)
+
+
+def _numbers(values: object) -> Array:
+    """As an array, of NaN where they are no numbers."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.array(np.nan)
 
 
 def per_element(values: ArrayLike, n_elements: int) -> Array:

@@ -22,7 +22,7 @@ from dlo_gym.rod._kernels_sensitivity import Carried
 from dlo_gym.rod.arrays import node_weights, rod_arrays
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.contact import ContactModel, check_clamps
-from dlo_gym.rod.dynamics import clamp_path, motion_of, plan_of
+from dlo_gym.rod.dynamics import clamp_path, damping_wrenches, empty_work, motion_of, plan_of
 from dlo_gym.rod.initial_shapes import hanging
 from dlo_gym.rod.obstacles import Obstacle, check_obstacles, on_the_way
 from dlo_gym.rod.properties import RodProperties
@@ -105,13 +105,7 @@ class CosseratRod:
         )
         softest = self._arrays.shear[:, 2].min()
         self._largest_strain = LARGEST_STRAIN + 3.0 * weight / softest
-        n_dofs = 6 * n_elements + 3
-        self._work = energy_kernels.Work(
-            stress=np.zeros((n_elements, 3)),
-            gradient=np.zeros(n_dofs),
-            band=np.zeros((n_dofs, 9)),
-            clamp_terms=np.zeros((2, 4, 3)),
-        )
+        self._work = empty_work(n_elements)
         self._boundary: BoundaryPoses | None = None
         self._contact = ContactModel(properties, n_elements, obstacles, self_contact, friction)
         self._stop()
@@ -146,7 +140,8 @@ class CosseratRod:
         Raises:
             ValueError: if the clamps are further apart than the rod is long, or one is inside an
                 obstacle.
-            RodDiverged: if no equilibrium was found; the rod keeps its former state.
+            RodDiverged: if no equilibrium was found; the rod keeps its former state, which is the
+                error's ``last_good``: None the first time.
         """
         self._check_boundary(boundary, self._contact.obstacles)
         if start is None:
@@ -200,6 +195,7 @@ class CosseratRod:
         self._check_boundary(target, moved)
         saved = self.state
         self._v, self._w = np.zeros((self.n_nodes, 3)), np.zeros((self.n_elements, 3))
+        self._spins = np.zeros((2, 3))
         vector = displacement.vector
         full_stride = 1.0 / max(1.0, np.ceil(self._move_size(vector)))
         done, stride = 0.0, full_stride
@@ -402,6 +398,7 @@ class CosseratRod:
             )
         self._time += duration
         self._set_clamps(target)
+        self._spins = path.velocity.reshape(2, 2, 3)[:, 1].copy()
         kernels.exact_stress(self._arrays, self._x, self._q, self._work.stress)
         self._linearise()
         return self.state
@@ -419,6 +416,8 @@ class CosseratRod:
         if self._motion.yields:
             energy_kernels.flow_plastically(self._arrays, curvature, plastic)
         wrenches = self._wrenches()
+        if self._v.any() or self._spins.any():
+            wrenches += self._damping_wrenches()
         return RodState(
             positions=self._x.copy(),
             quaternions=self._q.copy(),
@@ -433,7 +432,7 @@ class CosseratRod:
             angular_velocities=self._w.copy(),
             kinetic_energy=kinetic_energy(self._motion, self._v, self._w),
             plastic_curvature=plastic[1:-1].copy(),
-            memory=RodMemory(self._arrays.plastic.copy(), self._creep.copy()),
+            memory=RodMemory(self._arrays.plastic.copy(), self._creep.copy(), self._spins.copy()),
             time=self._time,
             contact=self._contact.state(self._x) if self._contact.possible else None,
         )
@@ -449,7 +448,7 @@ class CosseratRod:
         self._set(state.positions.copy(), state.quaternions.copy(), state.boundary)
         self._v, self._w = state.velocities.copy(), state.angular_velocities.copy()
         self._time = state.time
-        self._arrays.plastic[:], self._creep[:] = state.memory
+        self._arrays.plastic[:], self._creep[:], self._spins[:] = state.memory
         self._set_rest()
         self._work.stress[:] = state.stress
         self._contact.restore(state.contact)
@@ -496,6 +495,7 @@ class CosseratRod:
 
     def _stop(self) -> None:
         self._v, self._w = np.zeros((self.n_nodes, 3)), np.zeros((self.n_elements, 3))
+        self._spins = np.zeros((2, 3))
         self._time = 0.0
         self._creep = np.zeros((self.n_nodes, 3))
         self._arrays.plastic[:] = 0.0
@@ -648,6 +648,14 @@ class CosseratRod:
             wrenches[1, :3] = self._work.gradient[-3:]
             wrenches[1, 3:] = self._rotations[1] @ self._work.clamp_terms[1, 0]
         return wrenches
+
+    def _damping_wrenches(self) -> Array:
+        """(2, 6) what damping adds to them in motion."""
+        wrenches = damping_wrenches(
+            self._system, self._motion, self._shape[1:], (self._v, self._w), self._rotations,
+            self._spins,
+        )  # fmt: skip
+        return wrenches if self._ends.right_held else wrenches * [[1.0], [0.0]]
 
 
 def _frames_along(positions: Array, boundary: BoundaryPoses) -> Array:

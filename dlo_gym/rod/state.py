@@ -44,10 +44,12 @@ class RodMemory(NamedTuple):
     Attributes:
         plastic: (n_nodes, 2) plastic curvature before the last solve [1/m].
         creep: (n_nodes, 3) curvature at which the relaxing stiffness rests [1/m].
+        clamp_spins: (2, 3) angular velocities of the clamps, world axes [rad/s].
     """
 
     plastic: Array
     creep: Array
+    clamp_spins: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +64,7 @@ class RodState:
         strain: (n_elements, 3) shear (d1, d2) and stretch (d3) of each element [-].
         boundary: the clamp poses that hold it.
         wrench_left, wrench_right: (6,) force [N] and torque [N m], world axes, that the clamp
-            exerts on the rod at its end node; zero at a free end. In motion without the part of
-            internal damping.
+            exerts on the rod at its end node, damping included; zero at a free end.
         energy: elastic plus gravitational, and that of contact [J].
         stress: (n_elements, 3) internal force along d1, d2 (shear) and d3 (tension) [N].
         velocities: (n_nodes, 3) in world axes [m/s]; zero in equilibrium.

@@ -63,7 +63,17 @@ def evaluate_predictor(
         noise: standard deviation added to the coordinates that ``predict`` is given [m]; the error
             is then that of the predicted change.
         seed: of the noise.
+
+    Raises:
+        ValueError: naming the argument, if no rollout has a move so long.
     """
+    n_states = rollouts.positions.shape[1]
+    if not n_steps or not 0 <= min(n_steps) <= max(n_steps) < n_states:
+        raise ValueError(f"n_steps: expected 0 to {n_states - 1} each, got {n_steps}")
+    if stride < 1:
+        raise ValueError(f"stride: expected at least 1, got {stride}")
+    if not 0.0 <= noise < np.inf:
+        raise ValueError(f"noise: expected 0 or a positive length [m], got {noise}")
     rng = np.random.default_rng(seed)
     predictors = [predict_for(rollouts.properties(i)) for i in range(len(rollouts.rods))]
     scores = []

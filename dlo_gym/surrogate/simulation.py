@@ -74,25 +74,31 @@ class RolloutSettings:
     shard_size: int = 50
 
     def __post_init__(self) -> None:
-        for name in ("n_rollouts", "n_actions", "n_steps", "shard_size"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
-        if self.seed < 0:
-            raise ValueError(f"seed: expected at least 0, got {self.seed}")
-        if self.n_elements < 4:
-            raise ValueError(f"n_elements: expected at least 4, got {self.n_elements}")
+        for name, least in (
+            ("n_rollouts", 1), ("n_actions", 1), ("n_steps", 1), ("shard_size", 1), ("seed", 0),
+            ("n_elements", 4),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not isinstance(value, int | np.integer) or value < least:
+                raise ValueError(f"{name}: expected an integer of at least {least}, got {value!r}")
         for name, above in (
             ("length", 0.0), ("radius", 0.0), ("youngs_modulus", 0.0), ("poisson_ratio", -1.0),
         ):  # fmt: skip
             low, high = getattr(self, f"{name}_min"), getattr(self, f"{name}_max")
-            if not above < low <= high:
+            if not above < low <= high < np.inf:
                 raise ValueError(
                     f"{name}_min, {name}_max: expected {above:g} < {name}_min <= {name}_max,"
                     f" got {low} and {high}"
                 )
-        if not self.rest_curvature_max >= 0.0:
+        if not 0.0 <= self.rest_curvature_max < np.inf:
             raise ValueError(
-                f"rest_curvature_max: expected at least 0, got {self.rest_curvature_max}"
+                f"rest_curvature_max: expected 0 or more, got {self.rest_curvature_max}"
+            )
+        shortest = self.length_min / self.n_elements
+        if self.radius_max > shortest:
+            raise ValueError(
+                f"radius_max: expected at most the length of the shortest rod's elements,"
+                f" length_min / n_elements = {shortest:.4g} m, got {self.radius_max:.4g} m"
             )
         for name in ("translation", "rotation"):
             if not 0.0 <= getattr(self, name) < np.pi:
@@ -228,14 +234,14 @@ def _act(
             for i in range(first, first + settings.n_steps):
                 state = rod.move(step)
                 if np.abs(state.positions - before).max() > LARGEST_JUMP * rod.properties.length:
-                    raise RodDiverged("the rod snapped over")
+                    raise RodDiverged("the rod snapped over", last_good=start)
                 before = state.positions
                 _record(rod, state.boundary, i, positions, clamps)
         except (ValueError, RodDiverged):
             rod.restore(start)
             continue
         return
-    raise RodDiverged(f"no action that the rod can follow in {ATTEMPTS} attempts")
+    raise RodDiverged(f"no action that the rod can follow in {ATTEMPTS} attempts", last_good=start)
 
 
 def _record(

@@ -27,7 +27,7 @@ from dlo_gym.atomic_file import written_aside
 from dlo_gym.exceptions import DatasetError
 from dlo_gym.executor import run_tasks
 from dlo_gym.metrics import ptp_3d
-from dlo_gym.output_folder import check_output_folder
+from dlo_gym.output_folder import check_output_folder, check_resume
 from dlo_gym.surrogate.evaluation import recorded_moves
 from dlo_gym.surrogate.predictor import ShapePredictor
 from dlo_gym.surrogate.simulation import RolloutSettings, simulate_rollout
@@ -152,12 +152,15 @@ def evaluate_surrogate(
     Raises:
         FileExistsError: if OUT holds something and neither resume nor overwrite was given.
         DatasetError: if a file cannot be written; what was finished is kept for --resume.
-        ValueError: if OUT holds a sweep of other settings or networks.
+        WeightsError: if a file of weights is missing, damaged or of another version.
+        ValueError: if OUT holds a sweep of other settings or networks, or on conflicting options.
     """
     console = Console(stderr=True)
     names = [file.stem for file in weights]
     if len(set(names)) < len(names) or not names:
         raise ValueError(f"weights: expected files of different names, got {names}")
+    for file in weights:
+        load_weights(file)
     description = {
         "settings": asdict(settings),
         "weights": {f.stem: hashlib.sha256(f.read_bytes()).hexdigest() for f in weights},
@@ -206,9 +209,13 @@ def score_markdown(cells: list[dict[str, Any]], names: list[str]) -> str:
 
 def _open_sweep(out: Path, description: dict[str, Any], *, resume: bool, overwrite: bool) -> None:
     """Leaves a folder whose parts, if any, belong to ``description``."""
+    check_resume(resume, overwrite)
     file = out / "sweep.json"
     if resume and file.exists():
-        found = json.loads(file.read_text())
+        try:
+            found = json.loads(file.read_text())
+        except ValueError as error:
+            raise DatasetError(f"{file}: damaged: {error}") from error
         if found != json.loads(json.dumps(description)):
             raise ValueError(
                 f"{out} holds a sweep of other settings or weights: {found}; resume with the same"
@@ -227,7 +234,7 @@ def _cells(out: Path, settings: SweepSettings, names: list[str]) -> Iterator[dic
     n_parts, n_rods = len(settings.parts), len(settings.rods)
     for i, (modulus, radius) in enumerate(settings.rods):
         files = [_part_file(out, k) for k in range(i, n_parts, n_rods)]
-        errors = np.concatenate([np.load(file, allow_pickle=False) for file in files], axis=2)
+        errors = np.concatenate([_read_part(file) for file in files], axis=2)
         for j, steps in enumerate(settings.n_steps):
             for name, values in zip(names, errors[:, j], strict=True):
                 moves = values[np.isfinite(values)]
@@ -240,6 +247,15 @@ def _cells(out: Path, settings: SweepSettings, names: list[str]) -> Iterator[dic
                     "mean_mm": float(moves.mean(dtype=float)),
                     "percentiles_mm": [float(p) for p in np.percentile(moves, (5, 25, 50, 75, 95))],
                 }
+
+
+def _read_part(file: Path) -> Errors:
+    try:
+        return np.load(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise DatasetError(
+            f"{file}: damaged: {error}; remove it and go on with --resume"
+        ) from error
 
 
 def _part_file(out: Path, index: int) -> Path:

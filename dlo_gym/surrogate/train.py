@@ -17,6 +17,7 @@ from dlo_gym.atomic_file import written_aside
 from dlo_gym.exceptions import DatasetError, MissingExtra, WeightsError
 from dlo_gym.geometry.se3 import Array, exp_so3, matrix_to_quaternion
 from dlo_gym.interrupts import deferred_interrupt
+from dlo_gym.output_folder import check_resume
 from dlo_gym.rod.boundary import BoundaryDisplacement
 from dlo_gym.surrogate.conditioning import N_GROUPS
 from dlo_gym.surrogate.evaluation import Score, evaluate_predictor, score_table
@@ -33,6 +34,7 @@ except ModuleNotFoundError as error:
 from dlo_gym.surrogate.dataset import Batch, Moves, RolloutDataset, encode_plain
 from dlo_gym.surrogate.network import DloNetwork, RelativeNetwork
 
+SCHEMA = "dlo-training/1"
 CHECKPOINT_EVERY = 500
 VALIDATION_SIZE = 4096
 
@@ -69,7 +71,7 @@ class TrainingSettings:
         for name in ("steps", "batch_size", "hidden"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
-        if not (self.learning_rate > 0 and self.noise >= 0):
+        if not (0.0 < self.learning_rate < math.inf and 0.0 <= self.noise < math.inf):
             raise ValueError(
                 "learning_rate, noise: expected a positive and a non-negative number,"
                 f" got {self.learning_rate} and {self.noise}"
@@ -164,6 +166,7 @@ class Trainer:
             WeightsError: if it cannot be written.
         """
         content = {
+            "schema": SCHEMA,
             "settings": asdict(self.settings),
             "network": self.network.state_dict(),
             "best": self.best,
@@ -180,19 +183,28 @@ class Trainer:
         """Goes on from what ``save`` wrote.
 
         Raises:
-            WeightsError: if the file is damaged.
+            WeightsError: if the file is damaged or of another version.
             ValueError: if it was made with other settings.
         """
         try:
             content: dict[str, Any] = torch.load(file, weights_only=True)
         except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
             raise WeightsError(f"{file}: damaged checkpoint: {error}") from error
+        schema = content.get("schema") if isinstance(content, dict) else None
+        if schema != SCHEMA:
+            raise WeightsError(
+                f"{file}: expected a checkpoint of schema {SCHEMA}, got {schema}; train anew with"
+                " --overwrite"
+            )
         if content["settings"] != asdict(self.settings):
             raise ValueError(
                 f"settings: {file} was made with {content['settings']}, got"
                 f" {asdict(self.settings)}; resume with the same settings"
             )
-        self.network.load_state_dict(content["network"])
+        try:
+            self.network.load_state_dict(content["network"])
+        except RuntimeError as error:  # torch names the layers whose shapes differ
+            raise WeightsError(f"{file}: a network of another shape: {error}") from error
         self.optimiser.load_state_dict(content["optimiser"])
         self.generator.set_state(content["generator"])
         self.best, self.best_loss = content["best"], content["best_loss"]
@@ -261,8 +273,17 @@ def train_surrogate(
     Raises:
         FileExistsError: if OUT holds a training and neither resume nor overwrite was given.
         DatasetError: if the data are damaged or incomplete.
+        WeightsError: if the checkpoint or the weights are damaged or of another version.
+        ValueError: on options that conflict.
     """
     console = Console()
+    check_resume(resume, overwrite)
+    if evaluate and (resume or overwrite):
+        raise ValueError("evaluate: expected without resume and overwrite, got both")
+    if weights is not None and not evaluate:
+        raise ValueError(f"weights: expected with evaluate only, got {weights} for a training")
+    if threads < 1:
+        raise ValueError(f"threads: expected at least 1, got {threads}")
     rollouts, manifest = load_rollouts(data)
     if evaluate:
         predictor = ShapePredictor.load(weights)

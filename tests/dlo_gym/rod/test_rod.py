@@ -170,39 +170,6 @@ def test_overstretching_is_refused_with_both_lengths():
         rod.settle(BoundaryPoses(pose(np.eye(3), np.zeros(3)), far))
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"length": -1.0}, "length"),
-        ({"length": 0.5, "radius": 0.0}, "radius"),
-        ({"length": 0.5, "youngs_modulus": np.nan}, "youngs_modulus"),
-        ({"length": 0.5, "poisson_ratio": 0.7}, "poisson_ratio"),
-        ({"length": 0.5, "rest_curvature": (0.0, 1.0)}, "rest_curvature"),
-        ({"length": 0.5, "density": np.ones(7)}, "density: .* 50, got 7"),
-        ({"length": 0.5, "radius": np.ones(50), "density": np.ones(7)}, "density: .* 50, got 7"),
-        ({"length": 0.5, "rest_curvature": np.ones((50, 3))}, "rest_curvature: .* 49 rows, got 50"),
-    ],
-)
-def test_impossible_properties_are_named(options, message):
-    with pytest.raises(ValueError, match=message):
-        CosseratRod(RodProperties(**options), 50)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"n_elements": 2.5}, "n_elements"),
-        ({"n_elements": 1}, "n_elements"),
-        ({"gravity": (0.0, -9.81)}, "gravity"),
-        ({"gravity": (0.0, 0.0, np.nan)}, "gravity"),
-        ({"clamp": "edge"}, "clamp"),
-    ],
-)
-def test_impossible_arguments_are_named(options, message):
-    with pytest.raises(ValueError, match=message):
-        CosseratRod(RodProperties(LENGTH), **options)
-
-
 def test_properties_per_element_may_be_a_list():
     listed = RodProperties(LENGTH, youngs_modulus=[1e6] * 50, density=[1e3] * 50)
     boundary = random_boundary(np.random.default_rng(0), LENGTH)
@@ -210,14 +177,6 @@ def test_properties_per_element_may_be_a_list():
         CosseratRod(listed).settle(boundary).positions,
         CosseratRod(RodProperties(LENGTH)).settle(boundary).positions,
     )
-
-
-def test_asking_before_settling_says_what_to_do():
-    rod = CosseratRod(RodProperties(LENGTH))
-    with pytest.raises(ValueError, match="settle"):
-        rod.move(BoundaryDisplacement.zero())
-    with pytest.raises(ValueError, match="settle"):
-        _ = rod.state
 
 
 @pytest.mark.parametrize("seed", range(30))
