@@ -6,7 +6,7 @@ import numpy as np
 
 from dlo_gym.envs.cell import SimulatedCell
 from dlo_gym.envs.config import ShapeEnvConfig
-from dlo_gym.envs.tasks import sample_goal
+from dlo_gym.envs.goals import sample_goal
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryPoses
 from dlo_gym.scene.builder import SceneConfig

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from dlo_gym.envs import tasks
+from dlo_gym.envs import goals, tasks
 from dlo_gym.envs.actions import ClampAction
 from dlo_gym.envs.cell import Appearance, SimulatedCell, sample_occluder_paths
 from dlo_gym.envs.config import ShapeEnvConfig
@@ -191,7 +191,7 @@ class ShapeControlEnv(gym.Env):
         else:
             tasks.reset_to_random_start(self.cell, rng, config, occluders)
         if goal is None:
-            goal = tasks.sample_goal(self.cell, rng, config).centerline
+            goal = goals.sample_goal(self.cell, rng, config).centerline
         self._goal = goal
         self._estimate = self._observer.reset(self.cell)
         info = self._info(BoundaryDisplacement.zero(self.config.n_clamps), "")

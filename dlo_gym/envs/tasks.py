@@ -1,7 +1,6 @@
-"""The task: where the rod starts, which shape it shall take, what is progress and what failure."""
+"""The task: where the rod starts, what is progress and what failure."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,22 +16,6 @@ from dlo_gym.scene.clearance import clearance
 
 DENSE_UNIT = 0.1  # mean node error that costs 1 per step [m]
 ATTEMPTS = 200
-BLOCKED_ATTEMPTS = 5000  # of which one in some hundred is blocked, at a millisecond each
-DETOURS = 10  # tried per blocked way
-GOAL_STRETCH = 0.95  # of the largest distance between the clamps, at the goal
-
-
-@dataclass(frozen=True, eq=False)
-class Goal:
-    """A shape to reach.
-
-    Attributes:
-        centerline: (n_nodes, 3) world [m].
-        boundary: the clamp poses that held the rod in it when it was sampled.
-    """
-
-    centerline: Array
-    boundary: BoundaryPoses
 
 
 def shape_error(achieved: ArrayLike, desired: ArrayLike) -> Array:
@@ -93,27 +76,39 @@ def advance_all(cells: Sequence[SimulatedCell], twists: Array, config: ShapeEnvC
     What the arms do is worked out for all cells at once.
     """
     clamps = np.stack([cell.boundary.clamps for cell in cells])
-    reasons = _clamps_apart(cells, clamps[..., :3, 3] + twists[..., :3], config)
+    reasons = clamps_apart(cells, clamps[..., :3, 3] + twists[..., :3], config)
     joint_angles: Sequence[Array | None] = [None] * len(cells)
     arms = cells[0].arms
     if arms is not None:
         guesses = np.stack([_joint_angles(cell) for cell in cells])
         joint_angles = list(arms.reach(displace(clamps, twists), guesses))
     for i, (cell, twist, angles) in enumerate(zip(cells, twists, joint_angles, strict=True)):
-        reasons[i] = reasons[i] or _move(cell, twist, angles)
+        reasons[i] = reasons[i] or move(cell, twist, angles)
     moved = [i for i, reason in enumerate(reasons) if not reason]
-    if arms is not None and moved:
-        gaps = clearance(arms.T_world_base, np.stack([_joint_angles(cells[i]) for i in moved]))
-        for i, touching in zip(moved, gaps.smallest < 0.0, strict=True):
-            reasons[i] = "collision" if touching else ""
-    for i in moved:
-        lowest = cells[i].rod_state.positions[:, 2].min()
-        if not reasons[i] and lowest < np.max(cells[i].properties.radius):
-            reasons[i] = "table_contact"
+    if moved:
+        for i, reason in zip(moved, _contacts([cells[i] for i in moved]), strict=True):
+            reasons[i] = reason
     return reasons
 
 
-def _clamps_apart(cells: Sequence[SimulatedCell], ends: Array, config: ShapeEnvConfig) -> list[str]:
+def _contacts(cells: Sequence[SimulatedCell]) -> list[str]:
+    """What each of the cells touches where it stands that it must not, or ``""``."""
+    arms, reasons = cells[0].arms, [""] * len(cells)
+    if arms is not None:
+        gaps = clearance(arms.T_world_base, np.stack([_joint_angles(cell) for cell in cells]))
+        reasons = ["collision" if touching else "" for touching in gaps.smallest < 0.0]
+    return [
+        reason or ("table_contact" if above_table(cell) < 0.0 else "")
+        for reason, cell in zip(reasons, cells, strict=True)
+    ]
+
+
+def above_table(cell: SimulatedCell) -> float:
+    """Height of the rod's lowest node above where the rod would touch the table [m]."""
+    return float(cell.rod_state.positions[:, 2].min() - np.max(cell.properties.radius))
+
+
+def clamps_apart(cells: Sequence[SimulatedCell], ends: Array, config: ShapeEnvConfig) -> list[str]:
     """Which of the cells' clamps at ``ends`` (n, k, 3) [m] are too far apart or too near."""
     if ends.shape[1] == 1:
         return [""] * len(cells)
@@ -128,7 +123,9 @@ def _clamps_apart(cells: Sequence[SimulatedCell], ends: Array, config: ShapeEnvC
     ]
 
 
-def _move(cell: SimulatedCell, twist: Array, joint_angles: Array | None) -> str:
+def move(cell: SimulatedCell, twist: Array, joint_angles: Array | None) -> str:
+    """Move the clamps by ``twist`` (k, 6) [m], [rad], which arms at ``joint_angles`` (2, 6) [rad]
+    hold then; why they cannot, or ``""``."""
     if joint_angles is not None and np.isnan(joint_angles).any():
         return "unreachable"
     try:
@@ -161,42 +158,12 @@ def reset_to_random_start(
             cell.reset(_random_start(rng, config), occluders)
         except (UnreachablePose, RodDiverged, ValueError):
             continue
-        if advance(cell, BoundaryDisplacement.zero(config.n_clamps), config) == "":
-            cell.reset(cell.boundary, occluders)
+        ends = cell.boundary.clamps[None, :, :3, 3]
+        if clamps_apart([cell], ends, config) == _contacts([cell]) == [""]:
             return
     raise ValueError(
         f"no start found in {ATTEMPTS} attempts for start_distance={config.start_distance},"
         f" start_height={config.start_height}, start_noise={config.start_noise}"
-    )
-
-
-def sample_goal(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvConfig) -> Goal:
-    """A shape that the rod takes after a random sequence of motions from its present state.
-
-    Every step on the way is one that the environment would allow, so the goal can be reached; the
-    way leads over intermediate poses, so it is not the straight one. The cell is left as it was.
-
-    Raises:
-        ValueError: if the options leave no goal that can be reached.
-    """
-    start = cell.save()
-    try:
-        for _ in range(BLOCKED_ATTEMPTS if config.straight_way == "blocked" else ATTEMPTS):
-            cell.restore(start)
-            if not _wander(cell, start.rod.boundary, rng, config):
-                continue
-            goal = Goal(cell.rod_state.positions.copy(), cell.boundary)
-            distance = shape_error(goal.centerline, start.rod.positions)
-            stretch = goal.boundary.distance / (config.max_stretch * cell.properties.length)
-            near, far = config.goal_distance
-            if near <= distance <= far and stretch <= GOAL_STRETCH:
-                return goal
-    finally:
-        cell.restore(start)
-    raise ValueError(
-        f"no goal found in {ATTEMPTS} attempts for goal_distance={config.goal_distance} [m],"
-        f" goal_moves={config.goal_moves}, goal_translation={config.goal_translation} [m],"
-        f" goal_rotation={config.goal_rotation} [rad]"
     )
 
 
@@ -211,100 +178,3 @@ def _random_start(rng: np.random.Generator, config: ShapeEnvConfig) -> BoundaryP
             position[1] = tilt[1] = 0.0
         clamps.append(pose(along_x @ exp_so3(tilt), position))
     return BoundaryPoses(*clamps[: config.n_clamps])
-
-
-def _wander(
-    cell: SimulatedCell,
-    start: BoundaryPoses,
-    rng: np.random.Generator,
-    config: ShapeEnvConfig,
-) -> bool:
-    """Follow ``goal_moves`` random motions in steps; False if one of them is not allowed."""
-    if config.straight_way == "blocked":
-        return _detour(cell, rng, config)
-    return all(
-        _follow(cell, _random_motion(cell.boundary, start, rng, config), config)
-        for _ in range(config.goal_moves)
-    )
-
-
-def _detour(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvConfig) -> bool:
-    """Follow a random motion whose straight way is blocked, around over a translation to somewhere
-    else; False if none of some is allowed."""
-    start = cell.save()
-    boundary = start.rod.boundary
-    motion = _random_motion(boundary, boundary, rng, config)
-    if not straight_way_blocked(cell, boundary.displaced(motion), config):
-        return False
-    for _ in range(DETOURS):
-        around = _random_motion(boundary, boundary, rng, config).vector.reshape(2, 6)
-        around[:, 3:] = 0.0
-        legs = [
-            BoundaryDisplacement(*around),
-            BoundaryDisplacement(*(motion.vector.reshape(2, 6) - around)),
-        ]
-        cell.restore(start)
-        if all(_follow(cell, leg, config) for leg in legs):
-            return True
-    return False
-
-
-def straight_way_blocked(cell: SimulatedCell, goal: BoundaryPoses, config: ShapeEnvConfig) -> bool:
-    """Whether the arms can hold ``goal``, but would collide or not reach on the straight way of
-    the cell's clamps to it."""
-    guess = cell.joint_angles
-    if cell.arms is None or guess is None:
-        return False
-    motion = cell.boundary.displacement_to(goal)
-    n_steps = _n_steps(motion, cell.boundary, config)
-    shares = np.arange(1, n_steps + 1)[:, None, None] / n_steps
-    starts = np.repeat(cell.boundary.clamps[None], n_steps, axis=0)
-    clamps = displace(starts, shares * motion.vector.reshape(-1, 6))
-    joint_angles = np.empty((n_steps, 2, 6))
-    for i in range(n_steps):
-        joint_angles[i] = cell.arms.reach(clamps[i], guess)
-        guess = np.where(np.isnan(joint_angles[i]), guess, joint_angles[i])
-    reached = ~np.isnan(joint_angles).any(axis=(1, 2))
-    gaps = clearance(cell.arms.T_world_base, np.nan_to_num(joint_angles)).smallest
-    passable = reached & (gaps >= 0.0)
-    return bool(passable[-1] and not passable.all())
-
-
-def _random_motion(
-    boundary: BoundaryPoses,
-    start: BoundaryPoses,
-    rng: np.random.Generator,
-    config: ShapeEnvConfig,
-) -> BoundaryDisplacement:
-    """From ``boundary`` to somewhere around ``start``."""
-    low, high = np.asarray(config.workspace)
-    together = rng.uniform(-1.0, 1.0, 3)
-    apart = rng.uniform(-0.5, 0.5, (2, 3))
-    offsets = config.goal_translation * (together + apart)[: config.n_clamps]
-    targets = np.clip(start.clamps[:, :3, 3] + offsets, low, high)
-    rotations = (rng.uniform(-1.0, 1.0, (2, 2)) * config.goal_rotation)[: config.n_clamps]
-    if config.planar:
-        targets[:, 1] = boundary.clamps[:, 1, 3]
-        rotations[:, 1] = 0.0
-    twists = [
-        np.concatenate([target - clamp[:3, 3], clamp[:3, :2] @ rotation])
-        for clamp, target, rotation in zip(boundary.clamps, targets, rotations, strict=True)
-    ]
-    return BoundaryDisplacement(*twists)
-
-
-def _n_steps(motion: BoundaryDisplacement, boundary: BoundaryPoses, config: ShapeEnvConfig) -> int:
-    """How many steps a motion from ``boundary`` takes within the limits."""
-    twists = motion.vector.reshape(-1, 6)
-    turns = boundary.clamps[:, :3, :3].swapaxes(-1, -2) @ twists[:, 3:, None]
-    largest = max(
-        np.abs(twists[:, :3]).max() / config.max_translation_step,
-        np.abs(turns).max() / config.max_rotation_step,
-    )
-    return max(1, int(np.ceil(largest)))
-
-
-def _follow(cell: SimulatedCell, motion: BoundaryDisplacement, config: ShapeEnvConfig) -> bool:
-    n_steps = _n_steps(motion, cell.boundary, config)
-    step = motion.scaled(1.0 / n_steps)
-    return not any(advance(cell, step, config) for _ in range(n_steps))

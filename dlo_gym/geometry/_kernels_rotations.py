@@ -2,6 +2,7 @@
 
 from math import fabs, sqrt
 
+import numpy as np
 from numba import njit
 
 
@@ -52,3 +53,41 @@ def _is_rotation(m):
         + (m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]) * m[2, 2]
         > 0.0
     )
+
+
+@njit(cache=True)
+def parallel_transport(tangents, first_frame, frames):
+    """Update ``frames`` (n, 3, 3) to ``first_frame`` (3, 3) turned from tangent to tangent (n, 3)
+    by the smallest rotation each time."""
+    last, d1 = first_frame[:, 2].copy(), first_frame[:, 0].copy()
+    for i in range(len(tangents)):
+        tangent = tangents[i] / sqrt(_dot(tangents[i], tangents[i]))
+        cosine = _dot(last, tangent)
+        if cosine < -1.0 + 1e-9:  # opposite: half a turn about any perpendicular
+            axis = np.zeros(3)
+            axis[np.argmin(np.abs(last))] = 1.0
+            axis -= _dot(axis, last) * last
+            d1 = 2.0 * _dot(axis, d1) / _dot(axis, axis) * axis - d1
+        else:
+            # R = I + [v] + [v]^2 / (1 + cosine) with v = last x tangent
+            axis = _cross(last, tangent)
+            turn = _cross(axis, d1)
+            d1 = d1 + turn + _cross(axis, turn) / (1.0 + cosine)
+        d1 -= _dot(d1, tangent) * tangent  # orthonormal again: errors cannot grow
+        d1 /= sqrt(_dot(d1, d1))
+        frames[i, :, 0], frames[i, :, 1], frames[i, :, 2] = d1, _cross(tangent, d1), tangent
+        last = tangent
+
+
+@njit(cache=True)
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True)
+def _cross(a, b):
+    product = np.empty(3)
+    product[0] = a[1] * b[2] - a[2] * b[1]
+    product[1] = a[2] * b[0] - a[0] * b[2]
+    product[2] = a[0] * b[1] - a[1] * b[0]
+    return product

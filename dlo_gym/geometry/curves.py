@@ -4,7 +4,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
-from dlo_gym.geometry.se3 import Array, frame_along
+from dlo_gym.geometry import _kernels_rotations as kernels
+from dlo_gym.geometry.se3 import Array
 
 
 def arc_length(points: ArrayLike) -> Array:
@@ -39,25 +40,7 @@ def parallel_transport(tangents: ArrayLike, first_frame: ArrayLike) -> Array:
     Each frame is the previous one turned by the smallest rotation that takes tangent to tangent;
     d3 of frame i is tangent i.
     """
-    tangents = np.asarray(tangents, dtype=np.float64)
+    tangents = np.array(tangents, dtype=np.float64)
     frames = np.empty((len(tangents), 3, 3))
-    frame = np.asarray(first_frame, dtype=np.float64)
-    for i, tangent in enumerate(tangents):
-        d1 = _minimal_rotation(frame[:, 2], tangent) @ frame[:, 0]
-        frame = frames[i] = frame_along(tangent, d1)  # orthonormal again: errors cannot grow
+    kernels.parallel_transport(tangents, np.array(first_frame, dtype=np.float64), frames)
     return frames
-
-
-def _minimal_rotation(a: Array, b: Array) -> Array:
-    """The smallest rotation (3, 3) taking unit vector a to unit vector b."""
-    axis = np.cross(a, b)
-    cosine = float(np.dot(a, b))
-    if cosine < -1.0 + 1e-9:  # opposite: half a turn about any perpendicular
-        axis = np.eye(3)[np.argmin(np.abs(a))]
-        perpendicular = axis - (axis @ a) * a
-        perpendicular /= np.linalg.norm(perpendicular)
-        return 2.0 * perpendicular[:, None] * perpendicular - np.eye(3)
-    x, y, z = axis
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    rotation: Array = np.eye(3) + skew + skew @ skew / (1.0 + cosine)
-    return rotation

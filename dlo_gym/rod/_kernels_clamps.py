@@ -46,6 +46,14 @@ def displace_clamps(clamps, twists, out):
 
 
 @njit(cache=True)
+def displace_along(clamps, twists, out):
+    """Update ``out`` (s, m, 4, 4) to ``clamps`` (m, 4, 4) moved once, twice, ... by ``twists``
+    (m, 6)."""
+    for s in range(out.shape[0]):
+        displace_clamps(clamps if s == 0 else out[s - 1], twists, out[s])
+
+
+@njit(cache=True)
 def clamp_frame(clamp, rotation, quaternion):
     """Update ``rotation`` (3, 3) and ``quaternion`` wxyz (4,), w >= 0, to those of a pose (4, 4).
 

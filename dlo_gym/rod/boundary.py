@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dlo_gym.geometry.se3 import Array, check_single_pose, log_so3
-from dlo_gym.rod._kernels_clamps import displace_clamp, displace_clamps
+from dlo_gym.rod._kernels_clamps import displace_along, displace_clamp, displace_clamps
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +127,14 @@ def displace(clamps: Array, twists: Array) -> Array:
         moved.reshape(-1, 4, 4),
     )
     return moved
+
+
+def way(clamps: Array, twists: Array, n_steps: int) -> Array:
+    """Clamp poses (n_steps, k, 4, 4) on the way of ``clamps`` (k, 4, 4) that move by the same
+    ``twists`` (k, 6) [m], [rad] in every step."""
+    poses = np.empty((n_steps, *clamps.shape))
+    displace_along(np.ascontiguousarray(clamps), np.ascontiguousarray(twists), poses)
+    return poses
 
 
 def _displaced(clamp: Array, twist: Array | None) -> Array:

@@ -88,7 +88,7 @@ def hanging(boundary: BoundaryPoses, length: float, n_nodes: int) -> Array:
     if np.linalg.norm(down) < 1e-3:
         down = np.cross(along, [0.0, 1.0, 0.0])
     down /= np.linalg.norm(down)
-    t = np.linspace(0.0, 1.0, 8 * n_nodes)[:, None]
+    t = np.linspace(0.0, 1.0, 2 * n_nodes)[:, None]
 
     def curve(handle: float, sag: float) -> Array:
         p1, p2 = p0 + handle * d0, p3 - handle * d3

@@ -114,6 +114,11 @@ class CosseratRod:
     def n_nodes(self) -> int:
         return self.n_elements + 1
 
+    @property
+    def path_dependent(self) -> bool:
+        """Whether its shape at rest depends on the way there: it yields, or can touch something."""
+        return self._motion.yields or self._contact.possible
+
     def apply_forces(self, forces: ArrayLike) -> None:
         """Dead loads (n_nodes, 3) [N] on the nodes beside the weight, from the next solve on.
 

@@ -120,6 +120,18 @@ def nearest_solution(T_base_flange, guess, joint_angles):
 
 
 @njit(cache=True)
+def follow_solutions(T_base_flange, guess, joint_angles):
+    """Update ``joint_angles`` (s, k, 6) with solutions for flange poses (s, k, 4, 4) along a way,
+    each nearest to the last one there was, the first to ``guess`` (k, 6) [rad]."""
+    last = guess.copy()
+    for s in range(len(T_base_flange)):
+        nearest_solution(T_base_flange[s], last, joint_angles[s])
+        for side in range(len(last)):
+            if joint_angles[s, side, 0] == joint_angles[s, side, 0]:
+                last[side] = joint_angles[s, side]
+
+
+@njit(cache=True)
 def nearest_turn(angle, guess):
     """``angle`` by whole turns as close to ``guess`` as the joint limits allow [rad]."""
     turned = angle + 2.0 * pi * np.rint((guess - angle) / (2.0 * pi))
@@ -157,14 +169,22 @@ def capsule_axes(T_world_base, joint_angles, links, ends, axes):
 def clearances(axes, radii, above_table, pairs, between, table, within):
     """Update the smallest distances [m] of capsules with ``axes`` (b, 2, n, 2, 3), ``radii`` (n,):
     ``between`` (b,) the arms, to the ``table`` (b, 2), and ``within`` (b, 2) each arm over
-    ``pairs`` (m, 2) of its capsules."""
+    ``pairs`` (m, 2) of its capsules.
+
+    Pairs whose enclosing spheres are further apart than the smallest gap so far are left out.
+    """
     n = len(radii)
+    spheres = np.empty((2, n, 4))
     for b in range(len(axes)):
+        for side in range(2):
+            for i in range(n):
+                _enclose(axes[b, side, i], radii[i], spheres[side, i])
         between[b] = np.inf
-        for i in range(n):
-            for j in range(n):
-                gap = segment_distance(axes[b, 0, i], axes[b, 1, j]) - (radii[i] + radii[j])
-                between[b] = min(between[b], gap)
+        for i in range(n - 1, -1, -1):  # the grippers first: they are the nearest as a rule
+            for j in range(n - 1, -1, -1):
+                if not _apart(spheres[0, i], spheres[1, j], between[b]):
+                    gap = segment_distance(axes[b, 0, i], axes[b, 1, j]) - (radii[i] + radii[j])
+                    between[b] = min(between[b], gap)
         for side in range(2):
             table[b, side] = within[b, side] = np.inf
             for i in range(n):
@@ -173,8 +193,27 @@ def clearances(axes, radii, above_table, pairs, between, table, within):
                     table[b, side] = min(table[b, side], lowest - radii[i])
             for m in range(len(pairs)):
                 i, j = pairs[m]
-                gap = segment_distance(axes[b, side, i], axes[b, side, j])
-                within[b, side] = min(within[b, side], gap - radii[i] - radii[j])
+                if not _apart(spheres[side, i], spheres[side, j], within[b, side]):
+                    gap = segment_distance(axes[b, side, i], axes[b, side, j])
+                    within[b, side] = min(within[b, side], gap - radii[i] - radii[j])
+
+
+@njit(cache=True)
+def _enclose(axis, radius, sphere):
+    """Update ``sphere`` (4,), centre and radius [m], to hold a capsule with ``axis`` (2, 3)."""
+    squared = 0.0
+    for k in range(3):
+        sphere[k] = 0.5 * (axis[0, k] + axis[1, k])
+        squared += (axis[1, k] - axis[0, k]) ** 2
+    sphere[3] = 0.5 * sqrt(squared) + radius
+
+
+@njit(cache=True)
+def _apart(first, second, gap):
+    """Whether two spheres (4,) are further apart than ``gap`` [m]."""
+    reach = first[3] + second[3] + gap
+    squared = (first[0] - second[0]) ** 2 + (first[1] - second[1]) ** 2
+    return reach >= 0.0 and squared + (first[2] - second[2]) ** 2 > reach * reach
 
 
 @njit(cache=True)

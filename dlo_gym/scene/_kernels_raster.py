@@ -15,7 +15,9 @@ from dlo_gym.scene._kernels_rays import BOX, CAPSULE, CYLINDER, FAST, PLANE, mee
 
 TINTS = 64  # colours from one rim of a cylinder to the other
 SAMPLES = 4  # of a texture, across and down each pixel
-LANES = 8  # pixels that a processor takes at once, at most
+LANES = 16  # pixels that a processor takes at once, at most
+SINGLE = np.float32
+NONE, HALF, LAST = SINGLE(0.0), SINGLE(TINTS // 2), SINGLE(TINTS - 1)
 GLOSSY = 0.85  # cosine between normal and highlight from which it counts
 NEAREST = 0.02  # what comes closer to a camera has no outline: the whole image is searched [m]
 
@@ -185,73 +187,82 @@ def _fill(image, nearness, spans, kind, size, origin, rays, paint, lights):
 def _fill_box(image, nearness, spans, size, origin, rays, tints):
     """Update ``image`` and ``nearness`` inside the exact outline of a box, given ``_tint_box``."""
     first, last, left, right = spans
-    start, step = np.empty(3), np.empty(3)
+    begin, step = np.empty(3), np.empty(3)
     for v in range(first, last + 1):
+        start, stop = int(np.ceil(left[v])), int(np.floor(right[v])) + 1
         # The nearness of a face's plane is linear in the pixel; the box begins at the farthest.
         for k in range(3):
-            start[k], step[k] = np.inf, 0.0
+            begin[k], step[k] = np.inf, 0.0
             if abs(origin[k]) > size[k]:
                 apart = np.copysign(size[k], origin[k]) - origin[k]
-                start[k] = (rays[k, 1] * v + rays[k, 2]) / apart
+                begin[k] = (rays[k, 0] * start + rays[k, 1] * v + rays[k, 2]) / apart
                 step[k] = rays[k, 0] / apart
-        start_x, start_y, start_z = start[0], start[1], start[2]
+        begin_x, begin_y, begin_z = begin[0], begin[1], begin[2]
         step_x, step_y, step_z = step[0], step[1], step[2]
-        for u in range(int(np.ceil(left[v])), int(np.floor(right[v])) + 1):
-            near_x, near_y, near_z = (
-                start_x + step_x * u,
-                start_y + step_y * u,
-                start_z + step_z * u,
-            )
-            near = min(near_x, near_y, near_z)
-            if near <= nearness[v, u]:
-                continue
-            nearness[v, u] = near
-            face = 0 if near == near_x else (1 if near == near_y else 2)
-            for k in range(3):
-                image[v, u, k] = tints[face, k]
+        nearest, pixel = nearness[v, start:stop], image[v, start:stop]
+        for i in range(stop - start):
+            near_x, near_y = begin_x + step_x * i, begin_y + step_y * i
+            near = min(near_x, near_y, begin_z + step_z * i)
+            if near > nearest[i]:
+                nearest[i] = near
+                face = 0 if near == near_x else (1 if near == near_y else 2)
+                for k in range(3):
+                    pixel[i, k] = tints[face, k]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _fill_cylinder(image, nearness, spans, size, origin, rays, tints):
     """Update ``image`` and ``nearness`` inside an outline with a cylinder seen from beside its
-    axis, given ``_tint_cylinder``; the equations are ``meet``'s."""
+    axis, given ``_tint_cylinder``; the equations are ``meet``'s.
+
+    From a row's first pixel on all is linear but for the discriminant, which is quadratic: single
+    precision serves, and without a branch the compiler takes many pixels at a time.
+    """
     first, last, left, right = spans
     ox, oy, oz = origin[0], origin[1], origin[2]
     gx, gy, gz = rays[0, 0], rays[1, 0], rays[2, 0]
     radius_2 = size[0] * size[0]
     per_c = 1.0 / (ox * ox + oy * oy - radius_2)
-    per_upper, per_lower = 1.0 / (size[1] - oz), 1.0 / (-size[1] - oz)
-    above_cap = abs(oz) > size[1]
-    row = np.empty(image.shape[1] + LANES)
     tint_scale = 0.5 * TINTS / (size[0] * np.sqrt(ox * ox + oy * oy))
+    above_cap, facing = abs(oz) > size[1], np.copysign(size[1], oz)
+    per_cap, per_back = 1.0 / (facing - oz), 1.0 / (-facing - oz)
+    b_step, beside_step = ox * gx + oy * gy, ox * gy - oy * gx
+    b1, tint1 = SINGLE(b_step * per_c), SINGLE(beside_step * tint_scale)
+    cap1, back1 = SINGLE(gz * per_cap), SINGLE(gz * per_back)
+    square = radius_2 * (gx * gx + gy * gy) - beside_step * beside_step
+    square = SINGLE(square * per_c * per_c)
+    pixels = np.arange(image.shape[1] + LANES).astype(np.float32)
+    near, tint = np.empty_like(pixels), np.empty(len(pixels), np.uint8)
     for v in range(first, last + 1):
-        ex = rays[0, 1] * v + rays[0, 2]
-        ey = rays[1, 1] * v + rays[1, 2]
-        ez = rays[2, 1] * v + rays[2, 2]
         start, stop = int(np.ceil(left[v])), int(np.floor(right[v])) + 1
-        padded = start + (stop - start + LANES - 1) // LANES * LANES
-        # Without a branch, so that the compiler makes it several pixels at a time.
-        for u in range(start, padded):
-            dx, dy, dz = ex + gx * u, ey + gy * u, ez + gz * u
-            beside, b = ox * dy - oy * dx, ox * dx + oy * dy
-            discriminant = radius_2 * (dx * dx + dy * dy) - beside * beside
-            root = np.sqrt(max(discriminant, 0.0))
-            upper, lower = dz * per_upper, dz * per_lower
-            cap = max(upper, lower)
-            near = min((root - b) * per_c, cap if above_cap else np.inf)
-            far = max((-root - b) * per_c, min(upper, lower) if above_cap else cap)
-            row[u] = near if discriminant > 0.0 and near >= far else 0.0
-        for u in range(start, stop):
-            if row[u] <= nearness[v, u]:
-                continue
-            nearness[v, u] = near = row[u]
-            dx, dy, dz = ex + gx * u, ey + gy * u, ez + gz * u
-            beside = ox * dy - oy * dx
-            tint = min(max(int(0.5 * TINTS + tint_scale * beside / near), 0), TINTS - 1)
-            if above_cap and near > 0.999999 * max(dz * per_upper, dz * per_lower):
-                tint = TINTS
-            for k in range(3):
-                image[v, u, k] = tints[tint, k]
+        dx = rays[0, 1] * v + rays[0, 2] + gx * start
+        dy = rays[1, 1] * v + rays[1, 2] + gy * start
+        dz = rays[2, 1] * v + rays[2, 2] + gz * start
+        b, beside = ox * dx + oy * dy, ox * dy - oy * dx
+        b0, tint0 = SINGLE(b * per_c), SINGLE(beside * tint_scale)
+        cap0, back0 = SINGLE(dz * per_cap), SINGLE(dz * per_back)
+        linear = 2.0 * (radius_2 * (dx * gx + dy * gy) - beside * beside_step)
+        linear = SINGLE(linear * per_c * per_c)
+        constant = radius_2 * (dx * dx + dy * dy) - beside * beside
+        constant = SINGLE(constant * per_c * per_c)
+        for i in range((stop - start + LANES - 1) // LANES * LANES):
+            x = pixels[i]
+            discriminant = constant + x * (linear + x * square)
+            root, middle = np.sqrt(max(discriminant, NONE)), b0 + x * b1
+            cap, back = cap0 + x * cap1, back0 + x * back1
+            side = root - middle
+            on_cap = above_cap and cap < side
+            close = cap if on_cap else side
+            far = max(-root - middle, back if above_cap else max(cap, back))
+            near[i] = close if discriminant > NONE and close >= far else NONE
+            across = HALF + (tint0 + x * tint1) / close
+            tint[i] = TINTS if on_cap else np.uint8(min(max(across, NONE), LAST))
+        nearest, pixel = nearness[v, start:stop], image[v, start:stop]
+        for i in range(stop - start):
+            if near[i] > nearest[i]:
+                nearest[i] = near[i]
+                for k in range(3):
+                    pixel[i, k] = tints[tint[i], k]
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")

@@ -1,6 +1,7 @@
 """The two UR5e arms: where they stand, where the grippers are, joint angles that hold the rod."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -8,6 +9,7 @@ from numpy.typing import ArrayLike
 from dlo_gym.exceptions import UnreachablePose
 from dlo_gym.geometry.se3 import Array, check_pose, exp_so3, inverse, pose
 from dlo_gym.rod.boundary import BoundaryPoses
+from dlo_gym.scene._kernels_arms import follow_solutions
 from dlo_gym.scene.clearance import Clearance, clearance
 from dlo_gym.scene.ur5e import JOINT_LIMIT, link_frames, nearest_solution, why_unreachable
 
@@ -99,6 +101,16 @@ class DualArm:
         )
         return joint_angles
 
+    def follow(self, way: Array, guess: Array) -> Array:
+        """Joint angles (s, 2, 6) [rad] along a way of clamps (s, k, 4, 4), each nearest to those
+        before it, the first to ``guess`` (2, 6); NaN where an arm cannot reach its clamp."""
+        k = way.shape[1]
+        joint_angles = np.array(np.broadcast_to(guess, (len(way), 2, 6)))
+        held = np.empty((len(way), k, 6))
+        follow_solutions(np.ascontiguousarray(self.flange_in_base(way)), guess[:k], held)
+        joint_angles[:, :k] = held
+        return joint_angles
+
     def forward_kinematics(self, joint_angles: ArrayLike) -> BoundaryPoses:
         """The clamp poses where joint angles (2, 6) [rad] hold the rod's ends."""
         frames = link_frames(_check_joint_angles(joint_angles, "joint_angles"))
@@ -114,8 +126,15 @@ class DualArm:
         """``T_base_flange`` (..., k, 4, 4) of the first k arms whose grippers hold clamps
         (..., k, 4, 4) in world."""
         k = clamps.shape[-3]
-        T_clamp_flange = T_CLAMP_TCP[:k] @ inverse(self.T_flange_tcp[:k])
-        return inverse(self.T_world_base[:k]) @ clamps @ T_clamp_flange
+        return self._T_base_world[:k] @ clamps @ self._T_clamp_flange[:k]
+
+    @cached_property
+    def _T_base_world(self) -> Array:
+        return inverse(self.T_world_base)
+
+    @cached_property
+    def _T_clamp_flange(self) -> Array:
+        return T_CLAMP_TCP @ inverse(self.T_flange_tcp)
 
 
 def _check_joint_angles(joint_angles: ArrayLike, name: str) -> Array:

@@ -28,7 +28,7 @@ class ModelPrimitives:
         self._kinds[self._meshes] = BOX
         self._paints = _paints(model)
         # Their colour may change: it is looked up whenever they are posed.
-        self._by_material = np.array(
+        self._by_material = np.flatnonzero(
             [
                 material >= 0 and np.allclose(own, _UNPAINTED)
                 for own, material in zip(model.geom_rgba, model.geom_matid, strict=True)
@@ -43,9 +43,8 @@ class ModelPrimitives:
         sizes[self._meshes] = self._model.geom_aabb[self._meshes, 3:]
         ids = np.arange(self._model.ngeom)[geom_ids]
         ids = ids[self._model.geom_rgba[ids, 3] > 0.0]
-        of_material = np.flatnonzero(self._by_material)
-        materials = self._model.geom_matid[of_material]
-        self._paints[of_material, :3] = self._model.mat_rgba[materials, :3]
+        materials = self._model.geom_matid[self._by_material]
+        self._paints[self._by_material, :3] = self._model.mat_rgba[materials, :3]
         return Primitives(
             self._kinds[ids],
             sizes[ids],

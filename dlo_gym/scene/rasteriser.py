@@ -37,6 +37,7 @@ class RasterCanvas:
         self._fixed = scenery
         self._moving = np.setdiff1d(np.arange(model.ngeom), scenery)
         self._primitives = ModelPrimitives(model)
+        self._optics: dict[str, tuple[Pinhole, Lights]] = {}
         self._scenery: dict[str, Layer] = {}
         self._nearness: dict[str, NDArray[np.float32]] = {}
 
@@ -107,13 +108,11 @@ class RasterCanvas:
         # The nearest first, so that little is painted over.
         away = np.square(data.geom_xpos[geom_ids] - pinhole.centre).sum(axis=1)
         nearest_first = geom_ids[np.argsort(away, kind="stable")]
-        draw(
-            layer.rgb,
-            layer.nearness,
-            _pinhole(pinhole),
-            self._primitives.posed(data, nearest_first),
-            _lights(self._model, data, pinhole),
-        )
+        if pinhole.name not in self._optics:
+            self._optics[pinhole.name] = _pinhole(pinhole), _lights(self._model, data, pinhole)
+        optics, lights = self._optics[pinhole.name]
+        primitives = self._primitives.posed(data, nearest_first)
+        draw(layer.rgb, layer.nearness, optics, primitives, lights)
 
 
 def _pinhole(camera: CameraModel) -> Pinhole:

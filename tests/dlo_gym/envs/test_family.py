@@ -6,7 +6,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import dlo_gym
-from dlo_gym.envs import tasks
+from dlo_gym.envs import goals, tasks
 from dlo_gym.exceptions import RenderingUnavailable
 
 TASKS = list(dlo_gym.SHAPE_TASKS)
@@ -78,7 +78,7 @@ def test_the_straight_way_to_a_hard_goal_ends_in_a_collision():
         env.reset(seed=seed)
         cell, config = env.cell, env.config
         start = cell.save()
-        goal = tasks.sample_goal(cell, np.random.default_rng(seed), config)
+        goal = goals.sample_goal(cell, np.random.default_rng(seed), config)
         motion = cell.boundary.displacement_to(goal.boundary)
         twists = np.abs(motion.vector.reshape(2, 6)).max(axis=0)
         n_steps = int(np.ceil(max(twists[:3].max() / 0.01, twists[3:].max() / np.deg2rad(4.5))))
