@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dlo_gym.envs.cell import OccluderPath, SimulatedCell
+from dlo_gym.envs.cell import CellState, OccluderPath, SimulatedCell
 from dlo_gym.envs.config import ShapeEnvConfig
 from dlo_gym.exceptions import RodDiverged, UnreachablePose
 from dlo_gym.geometry.se3 import Array, exp_so3, pose
@@ -93,24 +93,35 @@ def advance_all(cells: Sequence[SimulatedCell], twists: Array, config: ShapeEnvC
     What the arms do is worked out for all cells at once.
     """
     clamps = np.stack([cell.boundary.clamps for cell in cells])
-    reasons = _clamps_apart(cells, clamps[..., :3, 3] + twists[..., :3], config)
+    ends = clamps[..., :3, 3] + twists[..., :3]
+    reasons = _clamps_apart(cells, ends, config)
     joint_angles: Sequence[Array | None] = [None] * len(cells)
     arms = cells[0].arms
     if arms is not None:
         guesses = np.stack([_joint_angles(cell) for cell in cells])
         joint_angles = list(arms.reach(displace(clamps, twists), guesses))
     for i, (cell, twist, angles) in enumerate(zip(cells, twists, joint_angles, strict=True)):
+        if not reasons[i] and cell.clamps_at_obstacle(ends[i]):
+            reasons[i] = "collision"
         reasons[i] = reasons[i] or _move(cell, twist, angles)
     moved = [i for i, reason in enumerate(reasons) if not reason]
     if arms is not None and moved:
         gaps = clearance(arms.T_world_base, np.stack([_joint_angles(cells[i]) for i in moved]))
         for i, touching in zip(moved, gaps.smallest < 0.0, strict=True):
-            reasons[i] = "collision" if touching else ""
+            reasons[i] = "collision" if touching or cells[i].arms_at_obstacle() else ""
     for i in moved:
+        if not reasons[i] and forbidden_touch(cells[i], config):
+            reasons[i] = "obstacle_contact"
         lowest = cells[i].rod_state.positions[:, 2].min()
         if not reasons[i] and lowest < np.max(cells[i].properties.radius):
             reasons[i] = "table_contact"
     return reasons
+
+
+def forbidden_touch(cell: SimulatedCell, config: ShapeEnvConfig) -> bool:
+    """Whether the rod touches an obstacle that it must not."""
+    forbidden = (touch == "forbidden" for touch in config.touches)
+    return any(hit and no for hit, no in zip(cell.touching, forbidden, strict=False))
 
 
 def _clamps_apart(cells: Sequence[SimulatedCell], ends: Array, config: ShapeEnvConfig) -> list[str]:
@@ -185,12 +196,8 @@ def sample_goal(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvC
             cell.restore(start)
             if not _wander(cell, start.rod.boundary, rng, config):
                 continue
-            goal = Goal(cell.rod_state.positions.copy(), cell.boundary)
-            distance = shape_error(goal.centerline, start.rod.positions)
-            stretch = goal.boundary.distance / (config.max_stretch * cell.properties.length)
-            near, far = config.goal_distance
-            if near <= distance <= far and stretch <= GOAL_STRETCH:
-                return goal
+            if far_enough(cell, start, config):
+                return Goal(cell.rod_state.positions.copy(), cell.boundary)
     finally:
         cell.restore(start)
     raise ValueError(
@@ -198,6 +205,14 @@ def sample_goal(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvC
         f" goal_moves={config.goal_moves}, goal_translation={config.goal_translation} [m],"
         f" goal_rotation={config.goal_rotation} [rad]"
     )
+
+
+def far_enough(cell: SimulatedCell, start: CellState, config: ShapeEnvConfig) -> bool:
+    """Whether the cell is as far from ``start``, and as little stretched, as a goal shall be."""
+    distance = shape_error(cell.rod_state.positions, start.rod.positions)
+    stretch = cell.boundary.distance / (config.max_stretch * cell.properties.length)
+    near, far = config.goal_distance
+    return bool(near <= distance <= far and stretch <= GOAL_STRETCH)
 
 
 def _random_start(rng: np.random.Generator, config: ShapeEnvConfig) -> BoundaryPoses:
@@ -223,7 +238,7 @@ def _wander(
     if config.straight_way == "blocked":
         return _detour(cell, rng, config)
     return all(
-        _follow(cell, _random_motion(cell.boundary, start, rng, config), config)
+        _follow(cell, random_motion(cell.boundary, start, rng, config), config)
         for _ in range(config.goal_moves)
     )
 
@@ -233,11 +248,11 @@ def _detour(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvConfi
     else; False if none of some is allowed."""
     start = cell.save()
     boundary = start.rod.boundary
-    motion = _random_motion(boundary, boundary, rng, config)
+    motion = random_motion(boundary, boundary, rng, config)
     if not straight_way_blocked(cell, boundary.displaced(motion), config):
         return False
     for _ in range(DETOURS):
-        around = _random_motion(boundary, boundary, rng, config).vector.reshape(2, 6)
+        around = random_motion(boundary, boundary, rng, config).vector.reshape(2, 6)
         around[:, 3:] = 0.0
         legs = [
             BoundaryDisplacement(*around),
@@ -256,12 +271,12 @@ def straight_way_blocked(cell: SimulatedCell, goal: BoundaryPoses, config: Shape
     if cell.arms is None or guess is None:
         return False
     motion = cell.boundary.displacement_to(goal)
-    n_steps = _n_steps(motion, cell.boundary, config)
-    shares = np.arange(1, n_steps + 1)[:, None, None] / n_steps
-    starts = np.repeat(cell.boundary.clamps[None], n_steps, axis=0)
+    n = n_steps(motion, cell.boundary, config)
+    shares = np.arange(1, n + 1)[:, None, None] / n
+    starts = np.repeat(cell.boundary.clamps[None], n, axis=0)
     clamps = displace(starts, shares * motion.vector.reshape(-1, 6))
-    joint_angles = np.empty((n_steps, 2, 6))
-    for i in range(n_steps):
+    joint_angles = np.empty((n, 2, 6))
+    for i in range(n):
         joint_angles[i] = cell.arms.reach(clamps[i], guess)
         guess = np.where(np.isnan(joint_angles[i]), guess, joint_angles[i])
     reached = ~np.isnan(joint_angles).any(axis=(1, 2))
@@ -270,7 +285,7 @@ def straight_way_blocked(cell: SimulatedCell, goal: BoundaryPoses, config: Shape
     return bool(passable[-1] and not passable.all())
 
 
-def _random_motion(
+def random_motion(
     boundary: BoundaryPoses,
     start: BoundaryPoses,
     rng: np.random.Generator,
@@ -293,7 +308,7 @@ def _random_motion(
     return BoundaryDisplacement(*twists)
 
 
-def _n_steps(motion: BoundaryDisplacement, boundary: BoundaryPoses, config: ShapeEnvConfig) -> int:
+def n_steps(motion: BoundaryDisplacement, boundary: BoundaryPoses, config: ShapeEnvConfig) -> int:
     """How many steps a motion from ``boundary`` takes within the limits."""
     twists = motion.vector.reshape(-1, 6)
     turns = boundary.clamps[:, :3, :3].swapaxes(-1, -2) @ twists[:, 3:, None]
@@ -305,6 +320,6 @@ def _n_steps(motion: BoundaryDisplacement, boundary: BoundaryPoses, config: Shap
 
 
 def _follow(cell: SimulatedCell, motion: BoundaryDisplacement, config: ShapeEnvConfig) -> bool:
-    n_steps = _n_steps(motion, cell.boundary, config)
-    step = motion.scaled(1.0 / n_steps)
-    return not any(advance(cell, step, config) for _ in range(n_steps))
+    n = n_steps(motion, cell.boundary, config)
+    step = motion.scaled(1.0 / n)
+    return not any(advance(cell, step, config) for _ in range(n))

@@ -61,3 +61,15 @@ def _minimal_rotation(a: Array, b: Array) -> Array:
     skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     rotation: Array = np.eye(3) + skew + skew @ skew / (1.0 + cosine)
     return rotation
+
+
+def swept_angle(points: ArrayLike, origin: ArrayLike, axis: ArrayLike) -> float:
+    """Angle [rad] that points (n, 3) sweep about the line through ``origin`` along ``axis``, right-
+    handed; more than a turn where they wind round it. No step may sweep half a turn or more."""
+    along = np.asarray(axis, dtype=np.float64)
+    along = along / np.linalg.norm(along)
+    away = np.asarray(points, dtype=np.float64) - np.asarray(origin, dtype=np.float64)
+    away = away - np.outer(away @ along, along)
+    before, after = away[:-1], away[1:]
+    sines = np.cross(before, after) @ along
+    return float(np.arctan2(sines, (before * after).sum(axis=1)).sum())
