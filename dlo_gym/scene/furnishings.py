@@ -122,7 +122,8 @@ class Furnishings:
                     kind = mujoco.mjtGeom.mjGEOM_CAPSULE
                     size = (obstacle.radius, obstacle.half_length, 0.0)
                 case Sphere():
-                    kind, size = mujoco.mjtGeom.mjGEOM_SPHERE, (obstacle.radius, 0.0, 0.0)
+                    # The rasteriser and the rays know capsules.
+                    kind, size = mujoco.mjtGeom.mjGEOM_CAPSULE, (obstacle.radius, 1e-9, 0.0)
                 case Plane():
                     raise ValueError(f"obstacles[{i}]: a Plane cannot be drawn, got {obstacle!r}")
             self._put(f"obstacle_{i}", 0, kind, size, obstacle.pose, color)
