@@ -161,7 +161,7 @@ class SimulatedCell:
         contact = self.rod_state.contact
         if contact is None:
             return np.zeros(0, dtype=bool)
-        return (contact.gaps < 0.0).any(axis=1)
+        return contact.gaps.min(axis=1) < 0.0
 
     def reset(self, boundary: BoundaryPoses, occluders: Sequence[OccluderPath] = ()) -> RodState:
         """Settle the rod between ``boundary``, among no obstacles, and set the clock to zero.

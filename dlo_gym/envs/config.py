@@ -207,8 +207,9 @@ class ShapeEnvConfig:
     @property
     def touches(self) -> tuple[str, ...]:
         """``touch`` of each obstacle."""
-        one = isinstance(self.touch, str)
-        return (self.touch,) * len(self.obstacles) if one else tuple(self.touch)
+        if isinstance(self.touch, str):
+            return (self.touch,) * len(self.obstacles)
+        return tuple(self.touch)
 
     @property
     def uses_images(self) -> bool:

@@ -102,9 +102,7 @@ def _way_round(
             joint_angles.append(cell.joint_angles)
     if not tasks.far_enough(cell, start, config):
         return None
-    return Way(
-        steps, np.stack(positions), None if cell.arms is None else np.stack(joint_angles)
-    )
+    return Way(steps, np.stack(positions), None if cell.arms is None else np.stack(joint_angles))
 
 
 def _straight_way(
@@ -154,9 +152,7 @@ def _place(
     return tuple(bodies)
 
 
-def _clear(
-    cell: SimulatedCell, start: CellState, around: Way, body: Obstacle, touch: str
-) -> bool:
+def _clear(cell: SimulatedCell, start: CellState, around: Way, body: Obstacle, touch: str) -> bool:
     """Whether the cable is clear of a body at the start and, unless it may touch it, on the way;
     and the clamps and arms always."""
     margin = MARGIN + float(np.max(cell.properties.radius))

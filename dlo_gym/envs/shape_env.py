@@ -43,7 +43,8 @@ class ShapeControlEnv(gym.Env):
     cable through the multi-view tracker, `dlo_gym/ShapeControlImages-v0` adds the views to the
     observation. So do the tasks `ShapeControlEasy`, `Medium` and `Hard` (the arms would collide on
     the straight way to the goal), `Planar` (in the vertical plane), `OneArm` (the right end free)
-    and `Obstacle` (posts and boxes stand in the straight way), e.g. `dlo_gym/ShapeControlHardTracked-v0`; `docs/environments.md` compares them.
+    and `Obstacle` (posts and boxes stand in the straight way), e.g.
+    `dlo_gym/ShapeControlHardTracked-v0`; `docs/environments.md` compares them.
 
     ## Action Space
     A `Box(-1, 1, (10,), float32)`, or `(12,)` with `axial_rotation=True`. Larger values are
@@ -391,9 +392,7 @@ class ShapeControlEnv(gym.Env):
         info = {"success": success, "is_success": success, "shape_error": error}
         return info | self._info_of_cell(displacement, termination)
 
-    def _info_of_cell(
-        self, displacement: BoundaryDisplacement, termination: str
-    ) -> dict[str, Any]:
+    def _info_of_cell(self, displacement: BoundaryDisplacement, termination: str) -> dict[str, Any]:
         """What there is to know whatever the task."""
         state = self.cell.rod_state
         hidden = occlusion_ratio(self.cell.visibility()) if self.config.uses_images else 0.0

@@ -79,7 +79,9 @@ class WrapBarConfig(ShapeEnvConfig):
         if not (np.isfinite(self.winding) and self.winding != 0):
             raise ValueError(f"winding: expected an angle other than 0 [rad], got {self.winding}")
         if not isinstance(self.hold_steps, int | np.integer) or self.hold_steps < 1:
-            raise ValueError(f"hold_steps: expected an integer of at least 1, got {self.hold_steps!r}")
+            raise ValueError(
+                f"hold_steps: expected an integer of at least 1, got {self.hold_steps!r}"
+            )
         if np.shape(self.bar_span) != (2,) or not self.bar_span[0] < self.bar_span[1]:
             raise ValueError(
                 f"bar_span: expected the free end's y below the stand's [m], got {self.bar_span}"

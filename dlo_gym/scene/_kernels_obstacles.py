@@ -59,9 +59,7 @@ def _distance_along(kind, size, ends, point, enough):
             at_second = _distance_at(kind, size, ends, second, point)
     return min(
         min(at_first, at_second),
-        min(
-            _distance_at(kind, size, ends, 0.0, point), _distance_at(kind, size, ends, 1.0, point)
-        ),
+        min(_distance_at(kind, size, ends, 0.0, point), _distance_at(kind, size, ends, 1.0, point)),
     )
 
 

@@ -8,9 +8,9 @@ from gymnasium.utils.env_checker import check_env
 
 import dlo_gym  # noqa: F401
 from dlo_gym.envs.randomization import Randomization
+from dlo_gym.envs.wrap_bar_script import WrapScript
 from dlo_gym.exceptions import RenderingUnavailable
 from dlo_gym.rod import BoundaryDisplacement, RodProperties
-from tests.dlo_gym.envs.wrap_controller import WrapController
 
 ID = "dlo_gym/WrapBar-v0"
 DOWN = np.array([0, 0, -1.0, 0, 0, 0, 0, -1.0, 0, 0])
@@ -21,12 +21,12 @@ def make(**options):
 
 
 def wrap(env, seed, steps=120):
-    """Infos and rewards of the scripted controller's episode, until success."""
+    """Infos and rewards of the script's episode, until success."""
     _, info = env.reset(seed=seed)
-    controller = WrapController(env)
+    script = WrapScript(env)
     infos, rewards = [info], []
     while not info["success"] and len(rewards) < steps:
-        _, reward, terminated, _, info = env.step(controller.action())
+        _, reward, terminated, _, info = env.step(script.action())
         assert not terminated, info["termination"]
         infos.append(info)
         rewards.append(reward)
@@ -51,12 +51,14 @@ def wrapped():
     return env, infos, rewards, env.cell.save()
 
 
-def test_the_scripted_controller_winds_the_cable_round_the_bar(wrapped):
+def test_the_script_winds_the_cable_round_the_bar(wrapped):
     _, infos, rewards, _ = wrapped
     windings = [info["winding"] for info in infos]
     assert -pi / 4 < windings[0] < 0
     assert windings[-1] >= tau
-    assert np.abs(np.diff(windings)).max() < 1.0  # never over the bar's end, which is a jump by 2 pi
+    assert (
+        np.abs(np.diff(windings)).max() < 1.0
+    )  # never over the bar's end, which is a jump by 2 pi
     assert infos[-1]["success"]
     assert [info["held_steps"] for info in infos[-5:]] == [1, 2, 3, 4, 5]
     assert not any(info["success"] for info in infos[:-1])
@@ -87,9 +89,7 @@ def test_a_wound_cable_stays_wound_while_the_arms_hold_still(wrapped):
         *_, info = env.step(np.zeros(10))
     assert info["success"]
     assert info["winding"] == pytest.approx(infos[-1]["winding"], abs=1e-6)
-    np.testing.assert_allclose(
-        env.cell.rod_state.positions, state.rod.positions, atol=1e-6
-    )
+    np.testing.assert_allclose(env.cell.rod_state.positions, state.rod.positions, atol=1e-6)
 
 
 def test_a_wound_cable_holds_against_a_pull_as_capstans_do(wrapped):

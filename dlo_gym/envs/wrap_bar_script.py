@@ -1,4 +1,4 @@
-"""A scripted way round the bar, for the right arm of the wrap-bar environment."""
+"""A scripted solution of the wrap-bar task: shows that there is one, and makes demonstrations."""
 
 import numpy as np
 
@@ -31,8 +31,11 @@ def waypoints(env: WrapBarEnv) -> Array:
     )
 
 
-class WrapController:
-    """Takes the right clamp from waypoint to waypoint, then holds still."""
+class WrapScript:
+    """Takes the right clamp from waypoint to waypoint, then holds still.
+
+    For positive windings of one turn. It knows the true clamps and bar.
+    """
 
     def __init__(self, env: WrapBarEnv) -> None:
         self._env = env
