@@ -53,7 +53,13 @@ for name, task in SHAPE_TASKS.items():
 
 for form, options in (
     ("", {}),
-    ("Tracked", {"observer": "tracking.observer:TrackerObserver"}),
+    (
+        "Tracked",
+        {
+            "observer": "tracking.observer:TrackerObserver",
+            "observer_options": {"predictor": "rod"},  # the network knows no obstacles
+        },
+    ),
     ("Images", {"observation_mode": "images"}),
 ):
     register(

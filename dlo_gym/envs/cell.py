@@ -148,6 +148,12 @@ class SimulatedCell:
         """The clamp poses that hold the rod."""
         return self.rod_state.boundary
 
+    def copy_of_rod(self) -> CosseratRod:
+        """Another rod like the cell's, in the same state among the same obstacles."""
+        rod = CosseratRod(self.properties, self.rod.n_elements, **self._contact_options)
+        rod.restore(self.rod_state)
+        return rod
+
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
         """What stands in the cell for the rod to touch."""
