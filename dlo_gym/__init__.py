@@ -22,6 +22,12 @@ SHAPE_TASKS = {
         "goal_distance": (0.06, 0.35),
         "workspace": ((-0.4, -0.25, 0.56), (0.1, 0.25, 0.75)),
     },
+    "Obstacle": {
+        "obstacles": ("post", "box", "post"),
+        "standing_obstacles": (1, 3),
+        "goal_distance": (0.08, 0.35),
+        "goal_translation": 0.2,
+    },
 }
 
 for name, task in SHAPE_TASKS.items():
@@ -43,6 +49,24 @@ for name, task in SHAPE_TASKS.items():
         entry_point="dlo_gym.envs.shape_env:ShapeControlEnv",
         max_episode_steps=100,
         kwargs=task | {"observation_mode": "images"},
+    )
+
+for form, options in (
+    ("", {}),
+    (
+        "Tracked",
+        {
+            "observer": "tracking.observer:TrackerObserver",
+            "observer_options": {"predictor": "rod"},  # the network knows no obstacles
+        },
+    ),
+    ("Images", {"observation_mode": "images"}),
+):
+    register(
+        id=f"dlo_gym/WrapBar{form}-v0",
+        entry_point="dlo_gym.envs.wrap_bar_env:WrapBarEnv",
+        max_episode_steps=300,
+        kwargs=options,
     )
 
 register(

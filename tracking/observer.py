@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Literal
 
 from dlo_gym.rod.boundary import BoundaryDisplacement
 from dlo_gym.rod.state import ShapeEstimate
-from tracking.predictors import check_predictor, make_predictor
+from tracking.predictors import RodPredictor, check_predictor, make_predictor
 from tracking.tracker import MultiViewTracker, TrackerConfig
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ class TrackerObserver:
 
     Args:
         predictor: "network" (the shipped ``ShapePredictor``, as in the paper), or "rod", which
-            knows the cell's rod exactly.
+            knows the cell's rod exactly, and what it touches.
         triangulation: see ``TrackerConfig``.
         lost_after: time unseen until ``TrackLost`` [s].
     """
@@ -34,11 +34,19 @@ class TrackerObserver:
     def reset(self, cell: "SimulatedCell") -> ShapeEstimate:
         """Learns the rod's looks from the first images and tracks it in them."""
         views = cell.views()
-        predictor = make_predictor(self._predictor, cell.properties, cell.n_nodes)
+        centerline = None
+        if self._predictor == "rod" and cell.obstacles:
+            predictor = RodPredictor(cell.properties, cell.n_nodes, rod=cell.copy_of_rod())
+            # Between the same clamps a rod may lie on either side of an obstacle.
+            centerline = cell.rod_state.positions
+        else:
+            predictor = make_predictor(self._predictor, cell.properties, cell.n_nodes)
         self._tracker = MultiViewTracker(
             predictor, [view.camera for view in views], config=self._config
         )
-        self._tracker.initialise(cell.boundary, cell.properties, stamp=cell.stamp)
+        self._tracker.initialise(
+            cell.boundary, cell.properties, centerline=centerline, stamp=cell.stamp
+        )
         at_rest = cell.boundary.displacement_to(cell.boundary)
         return self._tracker.update(views, at_rest, cell.stamp)
 

@@ -23,18 +23,25 @@ class RodPredictor:
     Args:
         properties: of the rod.
         n_nodes: of the centerline.
+        rod: a settled rod to go on with, among what it touches; one that touches
+            nothing if omitted.
         memory: share of the difference between the given shape and the old equilibrium that is
             carried over, from 0 (the new equilibrium) to 1.
     """
 
     def __init__(
-        self, properties: RodProperties, n_nodes: int = 51, *, memory: float = 0.8
+        self,
+        properties: RodProperties,
+        n_nodes: int = 51,
+        *,
+        rod: CosseratRod | None = None,
+        memory: float = 0.8,
     ) -> None:
         if not 0.0 <= memory <= 1.0:
             raise ValueError(f"memory: expected a share from 0 to 1, got {memory}")
         self.memory = memory
-        self._rod = CosseratRod(properties, n_elements=n_nodes - 1)
-        self._boundary: BoundaryPoses | None = None
+        self._rod = rod or CosseratRod(properties, n_elements=n_nodes - 1)
+        self._boundary: BoundaryPoses | None = None if rod is None else rod.state.boundary
 
     @property
     def n_nodes(self) -> int:

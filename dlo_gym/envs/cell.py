@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 from dlo_gym.geometry.camera import CameraModel, View
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
+from dlo_gym.rod.obstacles import Obstacle
 from dlo_gym.rod.properties import RodProperties
 from dlo_gym.rod.rod import CosseratRod
 from dlo_gym.rod.state import RodState
 from dlo_gym.scene.builder import SceneConfig
+from dlo_gym.scene.clearance import obstacle_clearance
+from dlo_gym.scene.furnishings import Clutter
 from dlo_gym.scene.renderer import SceneRenderer
 
 
@@ -46,11 +49,13 @@ class Appearance:
         rod_color: RGB in [0, 1]; the scene's where None.
         cameras: the scene's, as who looks at the images knows them; exactly where None.
         camera_latency: how many control steps old the images are.
+        clutter: on the table.
     """
 
     rod_color: Array | None = None
     cameras: tuple[CameraModel, ...] | None = None
     camera_latency: int = 0
+    clutter: Clutter | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +79,8 @@ class SimulatedCell:
         scene: what the cameras see.
         check_arms: whether every clamp pose must be in the arms' reach.
         control_step: how far the clock goes on with every move [s].
+        self_contact: whether the rod can touch itself.
+        friction: Coulomb's coefficient between rod and obstacles.
     """
 
     def __init__(
@@ -84,8 +91,11 @@ class SimulatedCell:
         scene: SceneConfig,
         check_arms: bool = True,
         control_step: float = 0.1,
+        self_contact: bool = False,
+        friction: float = 0.0,
     ) -> None:
-        self.rod = CosseratRod(properties, n_elements)
+        self._contact_options = {"self_contact": self_contact, "friction": friction}
+        self.rod = CosseratRod(properties, n_elements, **self._contact_options)
         self.scene = scene
         self.arms = scene.arms if check_arms else None
         self.control_step = control_step
@@ -95,15 +105,23 @@ class SimulatedCell:
         self._rod_state: RodState | None = None
         self._renderer: SceneRenderer | None = None
         self._posed = False
+        self._furnished = False
+        self._shown_obstacles: tuple[Obstacle, ...] = ()
         self._views: tuple[View, ...] | None = None
         self._visibility: NDArray[np.bool_] | None = None
         self._appearance = Appearance()
         self._past: deque[CellState] = deque(maxlen=1)
 
-    def replace_rod(self, properties: RodProperties, appearance: Appearance) -> None:
-        """Another rod of as many elements, looked at in another way, from the next reset on."""
-        self.rod = CosseratRod(properties, self.rod.n_elements)
+    def replace_rod(
+        self, properties: RodProperties, appearance: Appearance, friction: float | None = None
+    ) -> None:
+        """Another rod of as many elements, looked at in another way, from the next reset on; with
+        other ``friction`` if given."""
+        if friction is not None:
+            self._contact_options["friction"] = friction
+        self.rod = CosseratRod(properties, self.rod.n_elements, **self._contact_options)
         self._appearance = appearance
+        self._furnished = False
         self._past = deque(maxlen=1 + appearance.camera_latency)
 
     @property
@@ -130,8 +148,29 @@ class SimulatedCell:
         """The clamp poses that hold the rod."""
         return self.rod_state.boundary
 
+    def copy_of_rod(self) -> CosseratRod:
+        """Another rod like the cell's, in the same state among the same obstacles."""
+        rod = CosseratRod(self.properties, self.rod.n_elements, **self._contact_options)
+        rod.restore(self.rod_state)
+        return rod
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """What stands in the cell for the rod to touch."""
+        if self._rod_state is None or self._rod_state.contact is None:
+            return ()
+        return self._rod_state.contact.obstacles
+
+    @property
+    def touching(self) -> NDArray[np.bool_]:
+        """(m,) which of the obstacles the rod touches."""
+        contact = self.rod_state.contact
+        if contact is None:
+            return np.zeros(0, dtype=bool)
+        return contact.gaps.min(axis=1) < 0.0
+
     def reset(self, boundary: BoundaryPoses, occluders: Sequence[OccluderPath] = ()) -> RodState:
-        """Settle the rod between ``boundary`` and set the clock to zero.
+        """Settle the rod between ``boundary``, among no obstacles, and set the clock to zero.
 
         Raises:
             ValueError: if the clamps are too far apart, or there is another number of occluders
@@ -145,11 +184,30 @@ class SimulatedCell:
                 f" got {len(occluders)}"
             )
         joint_angles = self._reach(boundary, None)
+        if self.obstacles:
+            self.rod = CosseratRod(self.properties, self.rod.n_elements, **self._contact_options)
         self._rod_state = self.rod.settle(boundary)
         self.joint_angles = joint_angles
         self._occluders = tuple(occluders)
         self._past.clear()
         self._show(0.0)
+        return self._rod_state
+
+    def place_obstacles(self, obstacles: Sequence[Obstacle]) -> RodState:
+        """Put obstacles into the cell, in place of those that stand there; the rod settles among
+        them from where it is.
+
+        Raises:
+            ValueError: on more obstacles than the scene has colours for, or a clamp inside one.
+            RodDiverged: if the rod finds no equilibrium among them.
+        """
+        places = len(self.scene.obstacle_colors)
+        if len(obstacles) > places:
+            raise ValueError(f"obstacles: expected at most {places}, got {len(obstacles)}")
+        self.rod.set_obstacles(obstacles)
+        self._rod_state = self.rod.state
+        self._past.clear()
+        self._show(self.stamp)
         return self._rod_state
 
     def move(
@@ -186,11 +244,34 @@ class SimulatedCell:
         self._past.clear()
         self._show(state.stamp)
 
+    def start_clock(self) -> None:
+        """Set the clock to zero, as if nothing had moved before."""
+        self._past.clear()
+        self._show(0.0)
+
     def arms_in_collision(self) -> bool:
-        """Whether an arm or gripper touches the other arm, itself or the table."""
+        """Whether an arm or gripper touches the other arm, itself, the table or an obstacle."""
         if self.arms is None or self.joint_angles is None:
             return False
-        return self.arms.clearance(self.joint_angles).minimum < 0.0
+        return self.arms.clearance(self.joint_angles).minimum < 0.0 or self.arms_at_obstacle()
+
+    def arms_at_obstacle(self) -> bool:
+        """Whether an arm or gripper touches an obstacle."""
+        if self.arms is None or self.joint_angles is None or not self.obstacles:
+            return False
+        gaps = obstacle_clearance(self.arms.T_world_base, self.joint_angles, self.obstacles)
+        return bool((gaps < 0.0).any())
+
+    def clamps_at_obstacle(self, ends: Array) -> bool:
+        """Whether the rod would overlap an obstacle at clamps in ``ends`` (k, 3) [m]."""
+        contact = self.rod_state.contact
+        if contact is None or not contact.obstacles:
+            return False
+        moved = np.linalg.norm(ends - contact.points[[0, -1]][: len(ends)], axis=1)
+        if (contact.gaps[:, [0, -1]][:, : len(ends)] > moved).all():
+            return False
+        radius = float(np.max(self.properties.radius))
+        return any((body.signed_distance(ends) < radius).any() for body in contact.obstacles)
 
     def views(self) -> tuple[View, ...]:
         """One image per camera of the cell as it is now, or was ``camera_latency`` steps ago."""
@@ -217,7 +298,7 @@ class SimulatedCell:
         if self._renderer is not None:
             self._renderer.close()
         self._renderer = None
-        self._posed = False
+        self._posed = self._furnished = False
 
     def _reach(self, boundary: BoundaryPoses, guess: Array | None) -> Array | None:
         return None if self.arms is None else self.arms.inverse_kinematics(boundary, guess)
@@ -225,12 +306,18 @@ class SimulatedCell:
     def _show(self, stamp: float) -> None:
         self.stamp = stamp
         self._posed = False
+        if self.obstacles is not self._shown_obstacles:
+            self._shown_obstacles = self.obstacles
+            self._furnished = False
         self._views = self._visibility = None
         self._past.append(CellState(self.rod_state, self.joint_angles, stamp))
 
     def _posed_renderer(self) -> SceneRenderer:
         if self._renderer is None:
             self._renderer = SceneRenderer(self.scene)
+        if not self._furnished:
+            self._renderer.furnish(self.obstacles, self._appearance.clutter)
+            self._furnished = True
         if not self._posed:
             seen = self._past[0]
             occluders = np.array([path.position(seen.stamp) for path in self._occluders])

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ CHOICES = {
     "renderer": ("opengl", "raster"),
     "quality": ("fast", "high"),
 }
+TOUCHES = ("forbidden", "allowed")
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,14 @@ class ShapeEnvConfig:
         cameras: of the scene; the scene's own ``side`` and ``top`` if empty.
         image_scale: size of the images relative to the cameras'.
         clutter: ``"none"`` or ``"industrial"``.
+        obstacles: what may stand in the way to a goal, each a ``"post"`` or ``"box"`` on the table;
+            every reset places them anew.
+        touch: ``"forbidden"``, or ``"allowed"`` where the cable may touch an obstacle; the arms
+            never may. One for all obstacles, or one for each.
+        standing_obstacles: smallest and largest number of the obstacles, counted from the first,
+            that stand in an episode; None for all.
+        friction: Coulomb's coefficient between cable and obstacles.
+        self_contact: whether the cable can touch itself.
         n_distractor_cables, n_occluders: in the scene; the occluders are boxes that move.
         occluder_size: their full extents in x, y, z [m].
         renderer: ``"opengl"``, or ``"raster"``, which is faster on a CPU and needs no OpenGL.
@@ -96,6 +105,11 @@ class ShapeEnvConfig:
         (0.4, 0.25, 0.55),
     )
     check_arms: bool = True
+    obstacles: tuple[str, ...] = ()
+    touch: str | tuple[str, ...] = "forbidden"
+    standing_obstacles: tuple[int, int] | None = None
+    friction: float = 0.0
+    self_contact: bool = False
     cameras: tuple[CameraModel, ...] = ()
     image_scale: float = 0.5
     clutter: Literal["none", "industrial"] = "none"
@@ -104,6 +118,8 @@ class ShapeEnvConfig:
     occluder_size: tuple[float, float, float] = (0.12, 0.12, 0.12)
     renderer: Literal["opengl", "raster"] = "opengl"
     quality: Literal["fast", "high"] = "fast"
+
+    OBSTACLE_KINDS: ClassVar[tuple[str, ...]] = ("post", "box")
 
     def __post_init__(self) -> None:
         for name, choices in CHOICES.items():
@@ -129,6 +145,7 @@ class ShapeEnvConfig:
             self._check_number(name, positive=True)
         self._check_number("termination_penalty")
         self._check_number("goal_rotation")
+        self._check_obstacles()
         for name, least in (
             ("n_elements", 4), ("goal_moves", 1), ("n_distractor_cables", 0), ("n_occluders", 0),
         ):  # fmt: skip
@@ -188,6 +205,13 @@ class ShapeEnvConfig:
         return 1 if self.free_end else 2
 
     @property
+    def touches(self) -> tuple[str, ...]:
+        """``touch`` of each obstacle."""
+        if isinstance(self.touch, str):
+            return (self.touch,) * len(self.obstacles)
+        return tuple(self.touch)
+
+    @property
     def uses_images(self) -> bool:
         """Whether every step needs the cameras."""
         return self.observation_mode == "images" or self.observer != "privileged"
@@ -198,6 +222,36 @@ class ShapeEnvConfig:
         if not number or value < 0 or (positive and value == 0):
             kind = "positive" if positive else "non-negative"
             raise ValueError(f"{name}: expected a finite {kind} number, got {value!r}")
+
+    def _check_obstacles(self) -> None:
+        valid = self.OBSTACLE_KINDS
+        if isinstance(self.obstacles, str) or any(kind not in valid for kind in self.obstacles):
+            raise ValueError(
+                f"obstacles: expected a sequence of {', '.join(valid)}, got {self.obstacles!r}"
+            )
+        n = len(self.obstacles)
+        if len(self.touches) != n or any(how not in TOUCHES for how in self.touches):
+            raise ValueError(
+                f"touch: expected {' or '.join(TOUCHES)}, for all of {n} obstacles or each of them,"
+                f" got {self.touch!r}"
+            )
+        self._check_number("friction")
+        sampled = self.randomization is not None and self.randomization.friction is not None
+        if not n and (self.friction > 0 or sampled):
+            name = "friction" if self.friction > 0 else "randomization.friction"
+            value = self.friction or self.randomization.friction  # type: ignore[union-attr]
+            raise ValueError(f"{name}: expected none without obstacles to rub on, got {value}")
+        if self.standing_obstacles is not None:
+            low, high = np.asarray(self.standing_obstacles).ravel()[[0, -1]]
+            if np.shape(self.standing_obstacles) != (2,) or not 1 <= low <= high <= n:
+                raise ValueError(
+                    f"standing_obstacles: expected (lowest, highest) number of {n} obstacles,"
+                    f" got {self.standing_obstacles!r}"
+                )
+        if n and self.straight_way == "blocked":
+            raise ValueError(
+                'straight_way: expected "any" with obstacles, which block it, got "blocked"'
+            )
 
     def _check_pair(self, name: str) -> None:
         values = np.asarray(getattr(self, name), dtype=np.float64)

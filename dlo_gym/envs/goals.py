@@ -54,10 +54,8 @@ def sample_goal(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvC
         for _ in range(attempts):
             if not _wander(cell, start, rng, config):
                 continue
-            goal = Goal(cell.rod_state.positions.copy(), cell.boundary)
-            near, far = config.goal_distance
-            if near <= tasks.shape_error(goal.centerline, start.rod.positions) <= far:
-                return goal
+            if far_enough(cell, start, config):
+                return Goal(cell.rod_state.positions.copy(), cell.boundary)
     finally:
         cell.restore(start)
     raise ValueError(
@@ -65,6 +63,13 @@ def sample_goal(cell: SimulatedCell, rng: np.random.Generator, config: ShapeEnvC
         f" goal_moves={config.goal_moves}, goal_translation={config.goal_translation} [m],"
         f" goal_rotation={config.goal_rotation} [rad]"
     )
+
+
+def far_enough(cell: SimulatedCell, start: CellState, config: ShapeEnvConfig) -> bool:
+    """Whether the cell is as far from ``start``, and as little stretched, as a goal shall be."""
+    distance = tasks.shape_error(cell.rod_state.positions, start.rod.positions)
+    near, far = config.goal_distance
+    return bool(near <= distance <= far) and not _stretched(cell, cell.boundary, config)
 
 
 class Leg(NamedTuple):
@@ -94,14 +99,17 @@ def _wander(
     """
     ways = _detours if config.straight_way == "blocked" else _walks
     for legs in ways(cell, start, rng, config):
-        goal = legs[-1].end
-        if goal.distance > GOAL_STRETCH * config.max_stretch * cell.properties.length:
+        if _stretched(cell, legs[-1].end, config):
             continue
         if cell.rod_state is not start.rod:
             cell.restore(start)
         if all(_follow(cell, leg) for leg in legs):
             return True
     return False
+
+
+def _stretched(cell: SimulatedCell, goal: BoundaryPoses, config: ShapeEnvConfig) -> bool:
+    return goal.distance > GOAL_STRETCH * config.max_stretch * cell.properties.length
 
 
 def _walks(
@@ -111,7 +119,7 @@ def _walks(
     legs: list[Leg] = []
     boundary, joint_angles = start.rod.boundary, start.joint_angles
     for _ in range(config.goal_moves):
-        motion = _random_motion(boundary, start.rod.boundary, rng, config)
+        motion = random_motion(boundary, start.rod.boundary, rng, config)
         leg = _leg(cell, boundary, joint_angles, motion, config)
         if not _passable(cell, leg, config).all():
             return
@@ -127,11 +135,11 @@ def _detours(
     """Ways round to where a random motion leads whose straight way is blocked, each over a
     translation to somewhere else; none where the straight way is free."""
     boundary, joint_angles = start.rod.boundary, start.joint_angles
-    motion = _random_motion(boundary, boundary, rng, config)
+    motion = random_motion(boundary, boundary, rng, config)
     if not _blocked(cell, _leg(cell, boundary, joint_angles, motion, config)):
         return
     for _ in range(DETOURS):
-        around = _random_motion(boundary, boundary, rng, config).vector.reshape(2, 6)
+        around = random_motion(boundary, boundary, rng, config).vector.reshape(2, 6)
         around[:, 3:] = 0.0
         rest = BoundaryDisplacement(*(motion.vector.reshape(2, 6) - around))
         out = _leg(cell, boundary, joint_angles, BoundaryDisplacement(*around), config)
@@ -150,9 +158,9 @@ def _leg(
     config: ShapeEnvConfig,
 ) -> Leg:
     """``motion`` from ``boundary``, which ``joint_angles`` (2, 6) [rad] hold."""
-    n_steps = _n_steps(motion, boundary, config)
-    step = motion.scaled(1.0 / n_steps)
-    clamps = way(boundary.clamps, step.vector.reshape(-1, 6), n_steps)
+    n = n_steps(motion, boundary, config)
+    step = motion.scaled(1.0 / n)
+    clamps = way(boundary.clamps, step.vector.reshape(-1, 6), n)
     if cell.arms is None or joint_angles is None:
         return Leg(step, clamps, None)
     return Leg(step, clamps, cell.arms.follow(clamps, joint_angles))
@@ -207,7 +215,7 @@ def _moved(cell: SimulatedCell, leg: Leg, begin: int, end: int, height: float) -
     return tasks.move(cell, twist, joint_angles) == "" and tasks.above_table(cell) >= height
 
 
-def _random_motion(
+def random_motion(
     boundary: BoundaryPoses,
     start: BoundaryPoses,
     rng: np.random.Generator,
@@ -230,7 +238,7 @@ def _random_motion(
     return BoundaryDisplacement(*twists)
 
 
-def _n_steps(motion: BoundaryDisplacement, boundary: BoundaryPoses, config: ShapeEnvConfig) -> int:
+def n_steps(motion: BoundaryDisplacement, boundary: BoundaryPoses, config: ShapeEnvConfig) -> int:
     """How many steps a motion from ``boundary`` takes within the limits."""
     twists = motion.vector.reshape(-1, 6)
     turns = boundary.clamps[:, :3, :3].swapaxes(-1, -2) @ twists[:, 3:, None]

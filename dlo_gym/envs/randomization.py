@@ -8,6 +8,7 @@ import numpy as np
 from dlo_gym.geometry.camera import CameraModel
 from dlo_gym.geometry.se3 import Array, exp_so3, pose
 from dlo_gym.rod.properties import RodProperties
+from dlo_gym.scene.furnishings import sample_clutter
 
 Range = tuple[float, float]
 
@@ -20,7 +21,9 @@ class Randomization:
         youngs_modulus: [Pa], log-uniform.
         radius, length: [m], uniform.
         density: [kg/m^3], uniform.
+        friction: Coulomb's coefficient between rod and obstacles, uniform.
         rest_curvature: about d1 and about d2, each [1/m], uniform.
+        clutter: how many cables, and how many coloured blocks, lie on the table.
         rod_color: each of red, green, blue in [0, 1], uniform.
         camera_translation, camera_rotation: size of the error in each camera's pose as observers
             know it, in a random direction [m], [rad], uniform.
@@ -36,11 +39,13 @@ class Randomization:
     length: Range | None = None
     density: Range | None = None
     rest_curvature: Range | None = None
+    friction: Range | None = None
     rod_color: Range | None = None
     camera_translation: Range | None = None
     camera_rotation: Range | None = None
     camera_latency: tuple[int, int] | None = None
     arm_latency: tuple[int, int] | None = None
+    clutter: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         for option in fields(self):
@@ -58,6 +63,8 @@ class Randomization:
                 raise ValueError(f"rod_color: expected numbers in [0, 1], got {value!r}")
             if option.name.endswith("latency") and (ends != np.round(ends)).any():
                 raise ValueError(f"{option.name}: expected whole control steps, got {value!r}")
+            if option.name == "clutter" and (ends != np.round(ends)).any():
+                raise ValueError(f"clutter: expected whole numbers of things, got {value!r}")
 
     def sample(self, rng: np.random.Generator, cameras: tuple[CameraModel, ...]) -> dict[str, Any]:
         """A value of everything that has a range, by name."""
@@ -80,6 +87,12 @@ class Randomization:
             if getattr(self, name) is not None:
                 low, high = getattr(self, name)
                 values[name] = int(rng.integers(low, high, endpoint=True))
+        if self.friction is not None:
+            values["friction"] = float(rng.uniform(*self.friction))
+        if self.clutter is not None:
+            low, high = self.clutter
+            n_cables, n_blocks = rng.integers(low, high, size=2, endpoint=True)
+            values["clutter"] = sample_clutter(rng, n_cables, n_blocks, int(high))._asdict()
         return values
 
 

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +14,8 @@ from dlo_gym.envs.actions import ClampAction
 from dlo_gym.envs.cell import Appearance, SimulatedCell, sample_occluder_paths
 from dlo_gym.envs.config import ShapeEnvConfig
 from dlo_gym.envs.observers import make_observer
+from dlo_gym.envs.obstacle_course import sample_course
+from dlo_gym.envs.obstacle_rows import ROW, obstacle_rows
 from dlo_gym.envs.randomization import believed_cameras, randomized_properties
 from dlo_gym.exceptions import TrackLost
 from dlo_gym.geometry.curves import arc_length
@@ -21,10 +23,12 @@ from dlo_gym.geometry.se3 import Array
 from dlo_gym.metrics import occlusion_ratio, ptp_3d
 from dlo_gym.overlay import draw_overlay
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
+from dlo_gym.rod.obstacles import Obstacle
 from dlo_gym.rod.state import ShapeEstimate
 from dlo_gym.scene.builder import SceneConfig, default_cameras
+from dlo_gym.scene.furnishings import Clutter
 
-RESET_OPTIONS = ("start", "goal")
+OBSTACLE_COLORS = {"forbidden": (0.90, 0.62, 0.08), "allowed": (0.55, 0.60, 0.66)}  # RGB
 LONGEST_GOAL = 1.05  # of a given goal, in lengths of the rod: what its weight may stretch and noise
 
 
@@ -38,8 +42,9 @@ class ShapeControlEnv(gym.Env):
     own state, `dlo_gym/ShapeControlTracked-v0` renders two views in every step and observes the
     cable through the multi-view tracker, `dlo_gym/ShapeControlImages-v0` adds the views to the
     observation. So do the tasks `ShapeControlEasy`, `Medium` and `Hard` (the arms would collide on
-    the straight way to the goal), `Planar` (in the vertical plane) and `OneArm` (the right end
-    free), e.g. `dlo_gym/ShapeControlHardTracked-v0`; `docs/environments.md` compares them.
+    the straight way to the goal), `Planar` (in the vertical plane), `OneArm` (the right end free)
+    and `Obstacle` (posts and boxes stand in the straight way), e.g.
+    `dlo_gym/ShapeControlHardTracked-v0`; `docs/environments.md` compares them.
 
     ## Action Space
     A `Box(-1, 1, (10,), float32)`, or `(12,)` with `axial_rotation=True`. Larger values are
@@ -66,6 +71,10 @@ class ShapeControlEnv(gym.Env):
     |                  |             | end is free)                                              |
     | `achieved_goal`  | (3 n,)      | estimated centerline, world [m], node 0 at the left clamp |
     | `desired_goal`   | (3 n,)      | goal centerline, world [m]                                |
+    | `obstacles`      | (15 m,)     | only with m `obstacles`: a row for each that may stand,   |
+    |                  |             | zeros if it does not: 1; 1 if the cable may touch it;     |
+    |                  |             | position [m], d1, d3; half edges of a box, by how much it |
+    |                  |             | is rounded [m] (a post is a rounded line)                 |
     | `image_<camera>` | (h, w, 3)   | uint8 RGB; only with `observation_mode="images"`          |
 
     ## Rewards
@@ -85,6 +94,7 @@ class ShapeControlEnv(gym.Env):
     | `wrench_left`, `wrench_right` | (6,) force [N] and torque [N m] of each clamp on the rod, |
     |                               | world axes                                                |
     | `displacement`                | (12,) how the clamps really moved [m, rad], world axes    |
+    | `touching`                    | (m,) which obstacles the cable touches; with `obstacles`  |
     | `randomization`               | at reset, with `randomization` only: what was sampled     |
     | `termination`                 | why the episode ended early, or `""`                      |
 
@@ -95,18 +105,25 @@ class ShapeControlEnv(gym.Env):
     on another than the straight way. `reset(options={"start": BoundaryPoses, "goal": centerline})`
     sets either; an overstretched goal is refused.
 
+    With `obstacles`, all or some of them (`standing_obstacles`) stand in new places: the first one
+    where the cable would touch it if its clamps went straight to the goal, the others nearby. The
+    way round them was simulated: neither arms nor cable touch what they must not. Where touching is
+    allowed the goal may lean on an obstacle. `options` takes `"obstacles"`, a sequence of `Box`,
+    `Capsule` and `Sphere`, together with `"goal"`.
+
     ## Episode End
     Truncation after 100 steps (`gym.make(..., max_episode_steps=...)`). Termination, with the
     reason in `info["termination"]`; a motion that cannot be made leaves the cable where it was:
 
-    | Reason          | Meaning                                                          |
-    | --------------- | ---------------------------------------------------------------- |
-    | `overstretch`   | the clamps would be further apart than `max_stretch` rod lengths |
-    | `collision`     | the grippers or arms touch each other or the table               |
-    | `unreachable`   | an arm cannot take its clamp pose                                |
-    | `table_contact` | the cable touches the table                                      |
-    | `rod_diverged`  | no equilibrium of the rod was found                              |
-    | `track_lost`    | the observer has not seen the cable for too long                 |
+    | Reason             | Meaning                                                          |
+    | ------------------ | ---------------------------------------------------------------- |
+    | `overstretch`      | the clamps would be further apart than `max_stretch` rod lengths |
+    | `collision`        | the grippers or arms touch each other, the table or an obstacle  |
+    | `unreachable`      | an arm cannot take its clamp pose                                |
+    | `table_contact`    | the cable touches the table                                      |
+    | `obstacle_contact` | the cable touches an obstacle that it must not touch             |
+    | `rod_diverged`     | no equilibrium of the rod was found                              |
+    | `track_lost`       | the observer has not seen the cable for too long                 |
 
     Success does not end an episode.
 
@@ -118,6 +135,8 @@ class ShapeControlEnv(gym.Env):
     * v0: first version.
     """
 
+    CONFIG: ClassVar[type[ShapeEnvConfig]] = ShapeEnvConfig
+    RESET_OPTIONS: ClassVar[tuple[str, ...]] = ("start", "goal", "obstacles")
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(self, render_mode: str | None = None, **options: Any) -> None:
@@ -126,7 +145,7 @@ class ShapeControlEnv(gym.Env):
                 f"render_mode: expected None or one of {self.metadata['render_modes']},"
                 f" got {render_mode!r}"
             )
-        self.config = config = ShapeEnvConfig.from_options(options)
+        self.config = config = self.CONFIG.from_options(options)
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": round(1.0 / config.control_step)}
         self.cell = SimulatedCell(
@@ -135,6 +154,8 @@ class ShapeControlEnv(gym.Env):
             scene=_scene_config(config),
             check_arms=config.check_arms,
             control_step=config.control_step,
+            self_contact=config.self_contact,
+            friction=config.friction,
         )
         self._observer = make_observer(config.observer, config.observer_options)
         self._estimate: ShapeEstimate | None = None
@@ -169,30 +190,14 @@ class ShapeControlEnv(gym.Env):
     ) -> tuple[dict[str, NDArray], dict[str, Any]]:
         super().reset(seed=seed)
         options = options or {}
-        unknown = [name for name in options if name not in RESET_OPTIONS]
+        unknown = [name for name in options if name not in self.RESET_OPTIONS]
         if unknown:
             raise ValueError(
                 f"unknown reset option {', '.join(map(repr, unknown))};"
-                f" valid options are: {', '.join(RESET_OPTIONS)}"
+                f" valid options are: {', '.join(self.RESET_OPTIONS)}"
             )
-        config, rng = self.config, self.np_random
-        randomized = self._randomize() if config.randomization is not None else None
-        start, goal = options.get("start"), options.get("goal")
-        if start is not None and (
-            not isinstance(start, BoundaryPoses) or len(start.clamps) != config.n_clamps
-        ):
-            held = "one clamp" if config.free_end else "two clamps"
-            raise ValueError(f"start: expected BoundaryPoses of {held}, got {start!r}")
-        if goal is not None:
-            goal = check_goal(goal, config, self.cell.properties.length)
-        occluders = sample_occluder_paths(rng, self.cell.cameras, config.n_occluders)
-        if start is not None:
-            self.cell.reset(start, occluders)
-        else:
-            tasks.reset_to_random_start(self.cell, rng, config, occluders)
-        if goal is None:
-            goal = goals.sample_goal(self.cell, rng, config).centerline
-        self._goal = goal
+        randomized = self._randomize() if self.config.randomization is not None else None
+        self._begin(options)
         self._estimate = self._observer.reset(self.cell)
         info = self._info(BoundaryDisplacement.zero(self.config.n_clamps), "")
         if randomized is not None:
@@ -218,6 +223,44 @@ class ShapeControlEnv(gym.Env):
         )
         return observation, float(reward), bool(termination), False, info
 
+    def _begin(self, options: dict[str, Any]) -> None:
+        """Pose the cell for a new episode, and choose its goal."""
+        config, rng = self.config, self.np_random
+        start, goal, obstacles = (options.get(name) for name in ("start", "goal", "obstacles"))
+        if start is not None and (
+            not isinstance(start, BoundaryPoses) or len(start.clamps) != config.n_clamps
+        ):
+            held = "one clamp" if config.free_end else "two clamps"
+            raise ValueError(f"start: expected BoundaryPoses of {held}, got {start!r}")
+        if goal is not None:
+            goal = check_goal(goal, config, self.cell.properties.length)
+        if config.obstacles and (goal is None) != (obstacles is None):
+            raise ValueError(
+                "goal, obstacles: expected both or neither, for a way must lead round the obstacles"
+                f" to the goal; got goal={goal!r}, obstacles={obstacles!r}"
+            )
+        occluders = sample_occluder_paths(rng, self.cell.cameras, config.n_occluders)
+        if start is not None:
+            self.cell.reset(start, occluders)
+        else:
+            tasks.reset_to_random_start(self.cell, rng, config, occluders)
+        if obstacles is not None:
+            self._place_obstacles(obstacles)
+        if goal is None:
+            sample = sample_course if config.obstacles else goals.sample_goal
+            goal = sample(self.cell, rng, config).centerline
+        self._goal = goal
+
+    def _place_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        self.cell.place_obstacles(obstacles)
+        if self.cell.arms_at_obstacle():
+            raise ValueError("obstacles: expected clear of the arms at the start")
+        if tasks.forbidden_touch(self.cell, self.config):
+            touched = np.flatnonzero(self.cell.touching).tolist()
+            raise ValueError(
+                f"obstacles: expected clear of the cable at the start, got {touched} touching it"
+            )
+
     def delayed(self, displacement: BoundaryDisplacement) -> BoundaryDisplacement:
         """The motion that the arms make now that ``displacement`` is asked of them."""
         self._commands.append(displacement)
@@ -230,6 +273,17 @@ class ShapeControlEnv(gym.Env):
         except TrackLost:
             return False
         return True
+
+    def obstacle_numbers(self) -> NDArray[np.float32]:
+        """(15 m,) the obstacles as the observation carries them, a row for each that may stand."""
+        config = self.config
+        return obstacle_rows(self.cell.obstacles, config.touches, len(config.obstacles))
+
+    def touching(self) -> NDArray[np.bool_]:
+        """(m,) which of the obstacles that may stand the cable touches."""
+        touching = np.zeros(len(self.config.obstacles), dtype=bool)
+        touching[: len(self.cell.obstacles)] = self.cell.touching
+        return touching
 
     def compute_reward(
         self,
@@ -272,7 +326,7 @@ class ShapeControlEnv(gym.Env):
                     view,
                     estimate.centerline if visible is not None else None,
                     visible=visible,
-                    goal=self.goal,
+                    goal=self._goal,
                     caption=f"{view.camera.name}  {self.cell.stamp:.1f} s",
                 )
             )
@@ -293,7 +347,9 @@ class ShapeControlEnv(gym.Env):
                 values.get("rod_color"),
                 believed_cameras(self.cell.cameras, values),
                 values.get("camera_latency", 0),
+                Clutter(**values["clutter"]) if "clutter" in values else None,
             ),
+            values.get("friction"),
         )
         still = [BoundaryDisplacement.zero(self.config.n_clamps)] * values.get("arm_latency", 0)
         self._commands = deque(still)
@@ -307,6 +363,9 @@ class ShapeControlEnv(gym.Env):
             "achieved_goal": spaces.Box(-2.0, 2.0, (3 * n_nodes,), np.float32),
             "desired_goal": spaces.Box(-2.0, 2.0, (3 * n_nodes,), np.float32),
         }
+        if self.config.obstacles:
+            n_numbers = ROW * len(self.config.obstacles)
+            entries["obstacles"] = spaces.Box(-2.0, 2.0, (n_numbers,), np.float32)
         if self.config.observation_mode == "images":
             for camera in self.cell.cameras:
                 shape = (camera.height, camera.width, 3)
@@ -315,6 +374,12 @@ class ShapeControlEnv(gym.Env):
 
     def _observation(self) -> dict[str, NDArray]:
         observation = shape_observation(self.estimate.centerline, self.cell.boundary, self.goal)
+        return self._and_the_rest(observation)
+
+    def _and_the_rest(self, observation: dict[str, NDArray]) -> dict[str, NDArray]:
+        """``observation`` with obstacles and images, where there are any."""
+        if self.config.obstacles:
+            observation["obstacles"] = self.obstacle_numbers()
         if self.config.observation_mode == "images":
             for view in self.cell.views():
                 observation[f"image_{view.camera.name}"] = view.image.copy()
@@ -324,11 +389,14 @@ class ShapeControlEnv(gym.Env):
         state = self.cell.rod_state
         error = float(tasks.shape_error(state.positions, self.goal))
         success = error <= self.config.success_threshold
+        info = {"success": success, "is_success": success, "shape_error": error}
+        return info | self._info_of_cell(displacement, termination)
+
+    def _info_of_cell(self, displacement: BoundaryDisplacement, termination: str) -> dict[str, Any]:
+        """What there is to know whatever the task."""
+        state = self.cell.rod_state
         hidden = occlusion_ratio(self.cell.visibility()) if self.config.uses_images else 0.0
-        return {
-            "success": success,
-            "is_success": success,
-            "shape_error": error,
+        info = {
             "tracking_ptp3d": float(ptp_3d(self.estimate.centerline, state.positions).mean()),
             "occlusion_ratio": hidden,
             "wrench_left": state.wrench_left.copy(),
@@ -336,6 +404,9 @@ class ShapeControlEnv(gym.Env):
             "displacement": two_clamps(displacement.vector),
             "termination": termination,
         }
+        if self.config.obstacles:
+            info["touching"] = self.touching()
+        return info
 
 
 def shape_observation(
@@ -394,6 +465,7 @@ def check_goal(goal: ArrayLike, config: ShapeEnvConfig, length: float | None = N
 
 def _scene_config(config: ShapeEnvConfig) -> SceneConfig:
     cameras = config.cameras or default_cameras()
+    clutter = None if config.randomization is None else config.randomization.clutter
     return SceneConfig(
         cameras=tuple(camera.scaled(config.image_scale) for camera in cameras),
         rod_radius=float(np.max(config.properties.radius)),
@@ -401,6 +473,8 @@ def _scene_config(config: ShapeEnvConfig) -> SceneConfig:
         clutter=config.clutter,
         n_distractor_cables=config.n_distractor_cables,
         n_occluders=config.n_occluders,
+        obstacle_colors=tuple(OBSTACLE_COLORS[touch] for touch in config.touches),
+        n_clutter=0 if clutter is None else int(clutter[1]),
         occluder_size=config.occluder_size,
         renderer=config.renderer,
         quality=config.quality,

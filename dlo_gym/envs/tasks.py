@@ -76,31 +76,45 @@ def advance_all(cells: Sequence[SimulatedCell], twists: Array, config: ShapeEnvC
     What the arms do is worked out for all cells at once.
     """
     clamps = np.stack([cell.boundary.clamps for cell in cells])
-    reasons = clamps_apart(cells, clamps[..., :3, 3] + twists[..., :3], config)
+    ends = clamps[..., :3, 3] + twists[..., :3]
+    reasons = clamps_apart(cells, ends, config)
     joint_angles: Sequence[Array | None] = [None] * len(cells)
     arms = cells[0].arms
     if arms is not None:
         guesses = np.stack([_joint_angles(cell) for cell in cells])
         joint_angles = list(arms.reach(displace(clamps, twists), guesses))
     for i, (cell, twist, angles) in enumerate(zip(cells, twists, joint_angles, strict=True)):
+        if not reasons[i] and cell.clamps_at_obstacle(ends[i]):
+            reasons[i] = "collision"
         reasons[i] = reasons[i] or move(cell, twist, angles)
     moved = [i for i, reason in enumerate(reasons) if not reason]
     if moved:
-        for i, reason in zip(moved, _contacts([cells[i] for i in moved]), strict=True):
+        for i, reason in zip(moved, _contacts([cells[i] for i in moved], config), strict=True):
             reasons[i] = reason
     return reasons
 
 
-def _contacts(cells: Sequence[SimulatedCell]) -> list[str]:
+def _contacts(cells: Sequence[SimulatedCell], config: ShapeEnvConfig) -> list[str]:
     """What each of the cells touches where it stands that it must not, or ``""``."""
-    arms, reasons = cells[0].arms, [""] * len(cells)
+    arms, colliding = cells[0].arms, [False] * len(cells)
     if arms is not None:
         gaps = clearance(arms.T_world_base, np.stack([_joint_angles(cell) for cell in cells]))
-        reasons = ["collision" if touching else "" for touching in gaps.smallest < 0.0]
-    return [
-        reason or ("table_contact" if above_table(cell) < 0.0 else "")
-        for reason, cell in zip(reasons, cells, strict=True)
-    ]
+        colliding = [gap < 0.0 for gap in gaps.smallest]
+    reasons = []
+    for cell, touching in zip(cells, colliding, strict=True):
+        if touching or cell.arms_at_obstacle():
+            reasons.append("collision")
+        elif forbidden_touch(cell, config):
+            reasons.append("obstacle_contact")
+        else:
+            reasons.append("table_contact" if above_table(cell) < 0.0 else "")
+    return reasons
+
+
+def forbidden_touch(cell: SimulatedCell, config: ShapeEnvConfig) -> bool:
+    """Whether the rod touches an obstacle that it must not."""
+    forbidden = (touch == "forbidden" for touch in config.touches)
+    return any(hit and no for hit, no in zip(cell.touching, forbidden, strict=False))
 
 
 def above_table(cell: SimulatedCell) -> float:
@@ -159,7 +173,7 @@ def reset_to_random_start(
         except (UnreachablePose, RodDiverged, ValueError):
             continue
         ends = cell.boundary.clamps[None, :, :3, 3]
-        if clamps_apart([cell], ends, config) == _contacts([cell]) == [""]:
+        if clamps_apart([cell], ends, config) == _contacts([cell], config) == [""]:
             return
     raise ValueError(
         f"no start found in {ATTEMPTS} attempts for start_distance={config.start_distance},"

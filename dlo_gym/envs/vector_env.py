@@ -163,11 +163,14 @@ class ShapeControlVectorEnv(VectorEnv):
         return actions
 
     def _observations(self) -> Observations:
-        return flat_observation(
+        observations = flat_observation(
             np.stack([env.estimate.centerline for env in self.envs]),
             np.stack([env.cell.boundary.clamps for env in self.envs]),
             np.stack([env.goal for env in self.envs]),
         )
+        if self.config.obstacles:
+            observations["obstacles"] = np.stack([env.obstacle_numbers() for env in self.envs])
+        return observations
 
     def _infos(self, twists: Array, reasons: NDArray[Any]) -> dict[str, Any]:
         states = [env.cell.rod_state for env in self.envs]
@@ -187,6 +190,8 @@ class ShapeControlVectorEnv(VectorEnv):
             "displacement": two_clamps(twists.reshape(self.num_envs, -1)),
             "termination": reasons,
         }
+        if self.config.obstacles:
+            infos["touching"] = np.stack([env.touching() for env in self.envs])
         return infos | {f"_{key}": np.ones(self.num_envs, dtype=bool) for key in infos}
 
     def _start_over(

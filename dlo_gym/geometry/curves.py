@@ -44,3 +44,15 @@ def parallel_transport(tangents: ArrayLike, first_frame: ArrayLike) -> Array:
     frames = np.empty((len(tangents), 3, 3))
     kernels.parallel_transport(tangents, np.array(first_frame, dtype=np.float64), frames)
     return frames
+
+
+def swept_angle(points: ArrayLike, origin: ArrayLike, axis: ArrayLike) -> float:
+    """Angle [rad] that points (n, 3) sweep about the line through ``origin`` along ``axis``, right-
+    handed; more than a turn where they wind round it. No step may sweep half a turn or more."""
+    along = np.asarray(axis, dtype=np.float64)
+    along = along / np.linalg.norm(along)
+    away = np.asarray(points, dtype=np.float64) - np.asarray(origin, dtype=np.float64)
+    away = away - np.outer(away @ along, along)
+    before, after = away[:-1], away[1:]
+    sines = np.cross(before, after) @ along
+    return float(np.arctan2(sines, (before * after).sum(axis=1)).sum())

@@ -15,6 +15,7 @@ from dlo_gym.geometry.se3 import matrix_to_quaternion
 from dlo_gym.scene import arm_model, cell_model
 from dlo_gym.scene.arms import SIDES, DualArm
 from dlo_gym.scene.board import BoardPlate, add_board
+from dlo_gym.scene.furnishings import add_places
 from dlo_gym.scene.lens import Lens
 
 MULTISAMPLES = 4  # of quality "high"
@@ -41,6 +42,8 @@ class SceneConfig:
         n_distractor_cables: other cables lying on the table.
         n_occluders: opaque boxes that ``SceneRenderer.update`` moves.
         occluder_size: full extents in x, y, z [m].
+        obstacle_colors: RGB in [0, 1] of each obstacle that ``SceneRenderer.furnish`` may place.
+        n_clutter: how many cables, and how many blocks, it may strew on the table.
         renderer: "opengl", or "raster" without OpenGL, several times as fast on a CPU, which
             draws neither boards nor "high" quality.
         quality: "fast", or "high" with shadows and antialiasing.
@@ -60,6 +63,8 @@ class SceneConfig:
     n_distractor_cables: int = 0
     n_occluders: int = 0
     occluder_size: tuple[float, float, float] = (0.12, 0.08, 0.12)
+    obstacle_colors: tuple[tuple[float, float, float], ...] = ()
+    n_clutter: int = 0
     renderer: Literal["opengl", "raster"] = "opengl"
     quality: Literal["fast", "high"] = "fast"
     seed: int = 0
@@ -79,9 +84,13 @@ class SceneConfig:
             raise ValueError(f"rod_radius: expected 0 < radius < 0.05 m, got {self.rod_radius}")
         if self.n_nodes < 2 and self.n_nodes != 0:
             raise ValueError(f"n_nodes: expected at least 2, or 0 for no rod, got {self.n_nodes}")
-        color = np.asarray(self.rod_color, dtype=np.float64)
-        if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
-            raise ValueError(f"rod_color: expected RGB in [0, 1], got {self.rod_color}")
+        for name, colors in (
+            ("rod_color", (self.rod_color,)),
+            ("obstacle_colors", self.obstacle_colors),
+        ):
+            for color in map(np.asarray, colors):
+                if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
+                    raise ValueError(f"{name}: expected RGB in [0, 1], got {color.tolist()}")
         for name, choices in (
             ("clutter", ("none", "industrial")),
             ("renderer", ("opengl", "raster")),
@@ -96,7 +105,7 @@ class SceneConfig:
                 'renderer: expected "opengl" for boards or quality "high", got "raster" with'
                 f" {len(self.boards)} boards and quality {self.quality!r}"
             )
-        for name in ("n_distractor_cables", "n_occluders"):
+        for name in ("n_distractor_cables", "n_occluders", "n_clutter"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")
         size = np.asarray(self.occluder_size, dtype=np.float64)
@@ -151,6 +160,7 @@ def build_spec(config: SceneConfig) -> mujoco.MjSpec:
         add_board(spec, plate, config.arms.T_flange_tcp[SIDES.index(plate.side)])
     _add_rod(spec, config)
     _add_occluders(spec, config)
+    add_places(spec, len(config.obstacle_colors), config.n_clutter)
     for pinhole in pinholes:
         _add_camera(spec, pinhole)
     for geom in spec.geoms:

@@ -19,6 +19,8 @@ TABLE_CENTRE = (0.0, 0.12)
 TABLE_HALF_SIZE = (1.05, 0.62)
 HOLE_PITCH = 0.05  # of the table's threaded holes [m]
 
+CABLE_POINTS = 41  # of a cable that lies about
+
 # Colours of cables that lie about: black, blue, yellow, green, white, brown.
 CABLE_COLORS = (
     (0.06, 0.06, 0.07),
@@ -157,15 +159,20 @@ def _add_bin(world: mujoco.MjsBody, centre, half_size, rgb) -> None:
         _add(world, BOX, rim, (half_x + 2 * wall, 2 * wall, wall), rgb)
 
 
+def lying_cable(rng: np.random.Generator, layer: int) -> tuple[Array, float]:
+    """A cable that lies on the table in a random curve: (41, 3) points and its radius [m]."""
+    radius = rng.uniform(0.0025, 0.005)
+    x = np.linspace(-0.55, 0.55, 6) * rng.uniform(0.5, 1.0) + rng.uniform(-0.1, 0.1)
+    knots = np.column_stack([x, rng.uniform(-0.3, 0.4) + rng.normal(0.0, 0.09, 6)])
+    points = CubicSpline(np.arange(6), knots)(np.linspace(0.0, 5.0, CABLE_POINTS))
+    # A little higher for each layer, so that crossing ones overlap instead of merging.
+    return np.column_stack([points, np.full(CABLE_POINTS, radius + 0.004 * layer)]), radius
+
+
 def add_distractor_cables(spec: mujoco.MjSpec, n_cables: int, rng: np.random.Generator) -> None:
     """Cables lying on the table in random curves, as chains of capsules."""
     for i in range(n_cables):
-        radius = rng.uniform(0.0025, 0.005)
-        x = np.linspace(-0.55, 0.55, 6) * rng.uniform(0.5, 1.0) + rng.uniform(-0.1, 0.1)
-        knots = np.column_stack([x, rng.uniform(-0.3, 0.4) + rng.normal(0.0, 0.09, 6)])
-        points = CubicSpline(np.arange(6), knots)(np.linspace(0.0, 5.0, 41))
-        # A little higher for each cable, so that crossing ones overlap instead of merging.
-        points = np.column_stack([points, np.full(41, radius + 0.004 * i)])
+        points, radius = lying_cable(rng, i)
         for start, end in pairwise(points):
             spec.worldbody.add_geom(
                 type=CAPSULE,

@@ -1,11 +1,14 @@
-"""How far the arms are from each other, from the table and from themselves."""
+"""How far the arms are from each other, from the table, from themselves and from obstacles."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from dlo_gym.geometry.se3 import Array
+from dlo_gym.rod.obstacles import Obstacle, pack
 from dlo_gym.scene import _kernels_arms as kernels
+from dlo_gym.scene._kernels_obstacles import capsule_gaps
 
 # Capsules around the links and the gripper: DH frame, axis from, axis to [m], radius [m].
 CAPSULES = (
@@ -91,6 +94,17 @@ def clearance(T_world_base: Array, joint_angles: Array) -> Clearance:
     between[unknown[:, 0] | unknown[:, 1]] = np.nan
     batch = joint_angles.shape[:-2]
     return Clearance(between.reshape(batch), table.reshape(*batch, 2), within.reshape(*batch, 2))
+
+
+def obstacle_clearance(
+    T_world_base: Array, joint_angles: Array, obstacles: Sequence[Obstacle]
+) -> Array:
+    """Smallest distances (..., m) [m] of both arms on bases (2, 4, 4), at joint angles (..., 2, 6)
+    [rad], to each of m obstacles; negative where they overlap."""
+    axes = capsule_axes(T_world_base, joint_angles).reshape(-1, 2 * len(CAPSULES), 2, 3)
+    gaps = np.empty((len(axes), len(obstacles)))
+    capsule_gaps(axes, np.tile(CAPSULE_RADII, 2), pack(obstacles), gaps)
+    return gaps.reshape(*joint_angles.shape[:-2], len(obstacles))
 
 
 def segment_distances(first: Array, second: Array) -> Array:

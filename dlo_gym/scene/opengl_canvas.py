@@ -90,6 +90,10 @@ class OpenGlCanvas:
         finally:
             self._scene.flags[_SEGMENT_FLAGS] = False
 
+    def forget_scenery(self) -> None:
+        """Draw the scenery anew at the next look, for what stands in it has changed."""
+        self._scenery.clear()
+
     def _look(self, data: mujoco.MjData, name: str) -> None:
         camera = mujoco.MjvCamera()
         camera.type = mujoco.mjtCamera.mjCAMERA_FIXED

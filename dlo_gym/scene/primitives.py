@@ -24,13 +24,11 @@ class ModelPrimitives:
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
         self._meshes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)
-        self._kinds = model.geom_type.copy()
-        self._kinds[self._meshes] = BOX
         self._paints = _paints(model)
         # Their colour may change: it is looked up whenever they are posed.
         self._by_material = np.flatnonzero(
             [
-                material >= 0 and np.allclose(own, _UNPAINTED)
+                material >= 0 and np.allclose(own[:3], _UNPAINTED[:3])
                 for own, material in zip(model.geom_rgba, model.geom_matid, strict=True)
             ]
         )
@@ -39,14 +37,15 @@ class ModelPrimitives:
         self, data: mujoco.MjData, geom_ids: NDArray[np.intp] | slice = slice(None)
     ) -> Primitives:
         """Those of the geoms that are not hidden, where ``data`` has them."""
-        sizes = self._model.geom_size.copy()
+        kinds, sizes = self._model.geom_type.copy(), self._model.geom_size.copy()
+        kinds[self._meshes] = BOX
         sizes[self._meshes] = self._model.geom_aabb[self._meshes, 3:]
         ids = np.arange(self._model.ngeom)[geom_ids]
         ids = ids[self._model.geom_rgba[ids, 3] > 0.0]
         materials = self._model.geom_matid[self._by_material]
         self._paints[self._by_material, :3] = self._model.mat_rgba[materials, :3]
         return Primitives(
-            self._kinds[ids],
+            kinds[ids],
             sizes[ids],
             data.geom_xpos[ids],
             data.geom_xmat[ids].reshape(-1, 3, 3),

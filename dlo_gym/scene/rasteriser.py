@@ -61,6 +61,10 @@ class RasterCanvas:
         self._draw(layer, data, pinhole, geom_ids)
         return (layer.nearness > without).astype(np.uint8)
 
+    def forget_scenery(self) -> None:
+        """Draw the scenery anew at the next look, for what stands in it has changed."""
+        self._scenery.clear()
+
     def close(self) -> None:
         pass
 

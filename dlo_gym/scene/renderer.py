@@ -3,7 +3,7 @@
 # MuJoCo ships no type information.
 # pyright: reportAttributeAccessIssue=false
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Any, Protocol
 
@@ -14,8 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from dlo_gym.geometry.camera import CameraModel, View
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryPoses
+from dlo_gym.rod.obstacles import Obstacle
 from dlo_gym.scene._kernels_rays import first_hits
 from dlo_gym.scene.builder import SceneConfig, build_spec
+from dlo_gym.scene.furnishings import Clutter, Furnishings
 from dlo_gym.scene.lens import Lens
 from dlo_gym.scene.opengl_canvas import SCENERY_GROUP, OpenGlCanvas
 from dlo_gym.scene.primitives import ModelPrimitives
@@ -33,6 +35,10 @@ class Canvas(Protocol):
         self, data: mujoco.MjData, name: str, pinhole: CameraModel, geom_ids: NDArray[np.intp]
     ) -> NDArray[np.uint8]:
         """1 where a pixel (height, width) of camera ``name`` shows one of the geoms, else 0."""
+        ...
+
+    def forget_scenery(self) -> None:
+        """Draw the scenery anew at the next look, for what stands in it has changed."""
         ...
 
     @property
@@ -63,6 +69,9 @@ class SceneRenderer:
         self.model.geom_group[fixed] = SCENERY_GROUP
         self.rod_radius = self.config.rod_radius
         self._positions: Array | None = None
+        self._furnishings = Furnishings(
+            self.model, len(self.config.obstacle_colors), self.config.n_clutter
+        )
         self._primitives = ModelPrimitives(self.model)
         self._canvas: Canvas | None = None
 
@@ -125,6 +134,19 @@ class SceneRenderer:
         mujoco.mj_camlight(self.model, self.data)
         self._pose_rod(positions)
         self._pose_occluders(occluders)
+
+    def furnish(self, obstacles: Sequence[Obstacle] = (), clutter: Clutter | None = None) -> None:
+        """Put obstacles and clutter into the cell, in place of those that are there.
+
+        ``update`` poses them.
+
+        Raises:
+            ValueError: on more obstacles than the config has colours for, or a plane.
+        """
+        self._furnishings.place_obstacles(obstacles, self.config.obstacle_colors)
+        self._furnishings.strew(clutter)
+        if self._canvas is not None:
+            self._canvas.forget_scenery()
 
     def dress_rod(self, radius: float, color: ArrayLike | None = None) -> None:
         """Draw the rod with another ``radius`` [m] and RGB in [0, 1], the config's where None."""

@@ -18,6 +18,7 @@ EVERYTHING = Randomization(
     camera_rotation=(0.002, 0.005),
     camera_latency=(0, 2),
     arm_latency=(0, 2),
+    clutter=(0, 3),
 )
 
 
@@ -55,7 +56,7 @@ def test_every_reset_has_another_rod_and_says_so(env):
     for seed in range(3):
         _, info = env.reset(seed=seed)
         said, cell = info["randomization"], env.unwrapped.cell
-        assert said.keys() == set(EVERYTHING.__dataclass_fields__)
+        assert said.keys() == set(EVERYTHING.__dataclass_fields__) - {"friction"}
         for name in ("youngs_modulus", "radius", "length", "density"):
             assert getattr(cell.properties, name) == said[name]
         np.testing.assert_array_equal(cell.properties.rest_curvature, said["rest_curvature"])
@@ -152,6 +153,8 @@ def test_observers_are_told_of_cameras_that_stand_a_little_elsewhere():
         ({"arm_latency": (0, 1.5)}, "arm_latency: expected whole"),
         ({"camera_rotation": (-0.1, 0.1)}, "camera_rotation: expected non-negative"),
         ({"density": 3.0}, "density: expected"),
+        ({"clutter": (0, 1.5)}, "clutter: expected whole numbers"),
+        ({"friction": (-0.1, 0.1)}, "friction: expected non-negative"),
     ],
 )
 def test_wrong_ranges_are_named(wrong, said):
