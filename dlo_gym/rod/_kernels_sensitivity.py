@@ -475,29 +475,29 @@ def _add_kinetic_change(motion, sign, moment, tangent, out):
 
 
 @njit(cache=True)
-def share_gain(system, motion, gain, kinetic, ends, now, before, carried, work):
-    """Update ``carried.now`` for the scale sqrt(1 - gain / kinetic) of the velocities ``now``."""
+def share_gain(system, motion, gain, kinetic, noise, ends, now, before, carried, work):
+    """Update ``carried.now`` for the velocities' scale sqrt(1 - gain / kinetic), not yet applied to
+    ``now``; a gain within the ``noise`` [J] of the solver counts as given."""
     d_now, m = carried.now, carried.codes.shape[0]
-    left = 1.0 - gain / kinetic if kinetic > 0.0 else 0.0
-    if left <= 0.0:
-        d_now.speeds[:] = 0.0
-        d_now.w[:] = 0.0
-        return
-    d_gain, d_kinetic = np.zeros(m), np.zeros(m)
-    _add_energy_change(system, motion, 1.0, now, d_now, ends, carried, work, d_gain)
-    _add_energy_change(system, motion, -1.0, before, carried.before, ends, carried, work, d_gain)
-    _add_kinetic_change(motion, 1.0, now, d_now, d_kinetic)
-    for c in range(m):
-        d_kinetic[c] += mass_change(carried.codes[c], system.rod.rest_length.sum()) * kinetic
-    scale = sqrt(left)
-    slope = -0.5 / (scale * kinetic)
+    scale = sqrt(max(0.0, 1.0 - gain / kinetic)) if kinetic > 0.0 else 0.0
+    change = np.zeros(m)  # of the scale
+    if gain > noise and scale > 0.0:
+        d_gain, d_kinetic = np.zeros(m), np.zeros(m)
+        _add_energy_change(system, motion, 1.0, now, d_now, ends, carried, work, d_gain)
+        _add_energy_change(
+            system, motion, -1.0, before, carried.before, ends, carried, work, d_gain
+        )
+        _add_kinetic_change(motion, 1.0, now, d_now, d_kinetic)
+        for c in range(m):
+            heavier = mass_change(carried.codes[c], system.rod.rest_length.sum())
+            lost = d_gain[c] - gain * (d_kinetic[c] / kinetic + heavier)
+            change[c] = -0.5 * lost / (scale * kinetic)
     for i in range(now.speeds.shape[0]):
         for k in range(3):
             for c in range(m):
-                change = slope * (d_gain[c] - gain / kinetic * d_kinetic[c])
-                d_now.speeds[i, k, c] = scale * d_now.speeds[i, k, c] + change * now.speeds[i, k]
+                speed = scale * d_now.speeds[i, k, c]
+                d_now.speeds[i, k, c] = speed + change[c] * now.speeds[i, k]
     for e in range(now.w.shape[0]):
         for k in range(3):
             for c in range(m):
-                change = slope * (d_gain[c] - gain / kinetic * d_kinetic[c])
-                d_now.w[e, k, c] = scale * d_now.w[e, k, c] + change * now.w[e, k]
+                d_now.w[e, k, c] = scale * d_now.w[e, k, c] + change[c] * now.w[e, k]

@@ -28,10 +28,12 @@ from dlo_gym.rod.obstacles import Obstacle, check_obstacles, on_the_way
 from dlo_gym.rod.properties import RodProperties
 from dlo_gym.rod.sensitivity import (
     MOTION_PARAMETERS,
+    PARAMETERS,
     MotionSensitivity,
     at_rest,
     carried_of,
     check_parameters,
+    parameter_gradient,
     parameter_sensitivity,
     sensitivity_of,
     with_displacement,
@@ -356,7 +358,11 @@ class CosseratRod:
     def _by_parameters(self) -> Array:
         """(n_dofs, 7) of the unknowns by PARAMETERS, at an equilibrium."""
         weight = node_weights(self.properties, self.n_elements, self.gravity)
-        return parameter_sensitivity(self._arrays, weight, self._x, self._q, self._ends, self._work)
+        gradients = parameter_gradient(self._arrays, weight, self._x, self._q, self._ends)
+        if self._contact.possible:
+            by_length = gradients[:, PARAMETERS.index("length")]
+            self._contact.lengthen(self._x, self.properties.length, by_length)
+        return parameter_sensitivity(gradients, self._ends, self._work, self._contact)
 
     def _advance(
         self,
@@ -478,14 +484,13 @@ class CosseratRod:
 
         Columns follow ``sensitivity.PARAMETERS``: log EI, log GJ, log of the weight, the three
         components of a uniform rest curvature [1/m], and the length [m]. A rod that yields keeps
-        the plastic curvature it had before its last solve.
+        the plastic curvature it had before its last solve, and friction holds it where it does.
+        With contact the derivatives are those while the same points touch.
 
         Raises:
-            ValueError: if the rod has not settled, or can touch something.
+            ValueError: if the rod has not settled.
         """
         self._settled("parameter_sensitivity")
-        if self._contact.possible:
-            raise ValueError("parameter_sensitivity: expected a rod that can touch nothing")
         return self._of_nodes(self._by_parameters())
 
     def _of_nodes(self, columns: Array) -> Array:

@@ -12,6 +12,7 @@ from dlo_gym.rod._kernels_parameters import explicit_gradient
 from dlo_gym.rod._kernels_sensitivity import Carried, empty_carried
 from dlo_gym.rod._kernels_solve import free_range
 from dlo_gym.rod._kernels_tangent import empty_geometry, measure
+from dlo_gym.rod.contact import ContactModel
 
 PARAMETERS = (
     "log_EI",
@@ -112,22 +113,29 @@ def check_parameters(parameters: Sequence[str]) -> tuple[str, ...]:
     return tuple(parameters)
 
 
-def parameter_sensitivity(
-    rod: RodArrays, weight: Array, x: Array, q: Array, ends: Ends, work: Work
-) -> Array:
-    """d(unknowns)/d(PARAMETERS), shape (n_dofs, 7), given the factors of H in ``work``.
+def parameter_gradient(rod: RodArrays, weight: Array, x: Array, q: Array, ends: Ends) -> Array:
+    """d(gradient)/d(PARAMETERS), shape (n_dofs, 7), at the shape x, q, without contact.
 
-    H d(unknowns) = -d(gradient)/d(parameter); ``weight`` (n + 1, 3) [N] is of the nodes.
+    ``weight`` (n + 1, 3) [N] is of the nodes.
     """
     n = len(q)
     columns, geometry = np.empty((6 * n + 3, len(PARAMETERS))), empty_geometry(n)
     measure(rod, x, q, ends, geometry)
     explicit_gradient(rod, geometry, np.arange(len(PARAMETERS)), ends.right_held, weight, columns)
-    first, last = free_range(n, ends.right_held)
-    columns *= -1.0
+    return columns
+
+
+def parameter_sensitivity(gradients: Array, ends: Ends, work: Work, contact: ContactModel) -> Array:
+    """d(unknowns)/d(PARAMETERS), shape (n_dofs, 7), given the last solve's factors of H:
+    H d(unknowns) = -d(gradient)/d(parameters)."""
+    first, last = free_range((len(gradients) - 3) // 6, ends.right_held)
+    columns = -gradients
     columns[:first] = 0.0
     columns[last:] = 0.0
-    solve(work.band, first, last, columns)
+    if contact.possible:
+        contact.solve(first, last, columns)
+    else:
+        solve(work.band, first, last, columns)
     return columns
 
 
