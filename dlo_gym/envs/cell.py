@@ -129,6 +129,12 @@ class SimulatedCell:
         return self.rod.properties
 
     @property
+    def rod_radius(self) -> float:
+        """The rod's largest [m]."""
+        radius = self.properties.radius
+        return radius if isinstance(radius, float) else float(np.max(radius))
+
+    @property
     def n_nodes(self) -> int:
         return self.rod.n_nodes
 
@@ -321,9 +327,7 @@ class SimulatedCell:
         if not self._posed:
             seen = self._past[0]
             occluders = np.array([path.position(seen.stamp) for path in self._occluders])
-            self._renderer.dress_rod(
-                float(np.max(self.properties.radius)), self._appearance.rod_color
-            )
+            self._renderer.dress_rod(self.rod_radius, self._appearance.rod_color)
             self._renderer.update(
                 seen.rod.positions,
                 seen.rod.boundary,

@@ -182,9 +182,7 @@ def _arms_clear(cell: SimulatedCell, leg: Leg) -> NDArray[np.bool_]:
     """(n,) at which steps of a leg the arms reach the clamps and touch nothing."""
     if cell.arms is None or leg.joint_angles is None:
         return np.ones(len(leg.clamps), dtype=bool)
-    reached = ~np.isnan(leg.joint_angles).any(axis=(1, 2))
-    joint_angles = np.nan_to_num(leg.joint_angles)
-    return reached & (clearance(cell.arms.T_world_base, joint_angles).smallest >= 0.0)
+    return clearance(cell.arms.T_world_base, leg.joint_angles).smallest >= 0.0  # not if NaN
 
 
 def _follow(cell: SimulatedCell, leg: Leg) -> bool:

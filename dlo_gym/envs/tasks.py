@@ -1,6 +1,6 @@
 """The task: where the rod starts, what is progress and what failure."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -70,10 +70,15 @@ def advance(cell: SimulatedCell, displacement: BoundaryDisplacement, config: Sha
     return advance_all([cell], displacement.vector.reshape(1, -1, 6), config)[0]
 
 
-def advance_all(cells: Sequence[SimulatedCell], twists: Array, config: ShapeEnvConfig) -> list[str]:
+def advance_all(
+    cells: Sequence[SimulatedCell],
+    twists: Array,
+    config: ShapeEnvConfig,
+    each: Callable[..., Iterable[str]] = map,
+) -> list[str]:
     """``advance`` of each of n cells by twists (n, k, 6) [m], [rad] of their k clamps.
 
-    What the arms do is worked out for all cells at once.
+    What the arms do is worked out for all cells at once; ``each`` is how to ``map`` the rest.
     """
     clamps = np.stack([cell.boundary.clamps for cell in cells])
     ends = clamps[..., :3, 3] + twists[..., :3]
@@ -83,10 +88,13 @@ def advance_all(cells: Sequence[SimulatedCell], twists: Array, config: ShapeEnvC
     if arms is not None:
         guesses = np.stack([_joint_angles(cell) for cell in cells])
         joint_angles = list(arms.reach(displace(clamps, twists), guesses))
-    for i, (cell, twist, angles) in enumerate(zip(cells, twists, joint_angles, strict=True)):
-        if not reasons[i] and cell.clamps_at_obstacle(ends[i]):
+    for i, (cell, points) in enumerate(zip(cells, ends, strict=True)):
+        if not reasons[i] and cell.clamps_at_obstacle(points):
             reasons[i] = "collision"
-        reasons[i] = reasons[i] or move(cell, twist, angles)
+    free = [i for i, reason in enumerate(reasons) if not reason]
+    arguments = [[values[i] for i in free] for values in (cells, twists, joint_angles)]
+    for i, reason in zip(free, each(move, *arguments), strict=True):
+        reasons[i] = reason
     moved = [i for i, reason in enumerate(reasons) if not reason]
     if moved:
         for i, reason in zip(moved, _contacts([cells[i] for i in moved], config), strict=True):
@@ -119,7 +127,7 @@ def forbidden_touch(cell: SimulatedCell, config: ShapeEnvConfig) -> bool:
 
 def above_table(cell: SimulatedCell) -> float:
     """Height of the rod's lowest node above where the rod would touch the table [m]."""
-    return float(cell.rod_state.positions[:, 2].min() - np.max(cell.properties.radius))
+    return float(cell.rod_state.positions[:, 2].min()) - cell.rod_radius
 
 
 def clamps_apart(cells: Sequence[SimulatedCell], ends: Array, config: ShapeEnvConfig) -> list[str]:

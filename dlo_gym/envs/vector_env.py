@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dlo_gym.envs import tasks
 from dlo_gym.envs.shape_env import ShapeControlEnv, flat_observation, two_clamps
+from dlo_gym.envs.threads import Threads, n_cores
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryDisplacement
 
@@ -32,6 +33,7 @@ class ShapeControlVectorEnv(VectorEnv):
             ``"NextStep"`` with the next step, whose action it ignores, ``"SameStep"`` at once,
             with the last observation in ``info["final_obs"]``, or ``"Disabled"``: by
             ``reset(options={"reset_mask": ...})`` alone.
+        threads: that move the rods and start episodes; one per processor core where None.
         render_mode, options: of each environment.
 
     Raises:
@@ -44,11 +46,14 @@ class ShapeControlVectorEnv(VectorEnv):
         *,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        threads: int | None = None,
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs: expected at least 1, got {num_envs}")
+        if threads is not None and threads < 1:
+            raise ValueError(f"threads: expected at least 1, or None, got {threads}")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.envs = [ShapeControlEnv(render_mode, **options) for _ in range(num_envs)]
         first = self.envs[0]
@@ -65,6 +70,7 @@ class ShapeControlVectorEnv(VectorEnv):
         self.single_action_space = first.action_space
         self.observation_space = batch_space(first.observation_space, num_envs)
         self.action_space = batch_space(first.action_space, num_envs)
+        self._threads = Threads(min(threads or n_cores(), num_envs))
         self._max_steps = max_episode_steps
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._over: NDArray[np.bool_] | None = None  # whose episode has ended; None: no reset yet
@@ -90,9 +96,9 @@ class ShapeControlVectorEnv(VectorEnv):
         mask: NDArray[np.bool_],
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode where ``mask`` (n,) says so, each with a seed and options of its own."""
+        which = np.flatnonzero(mask).tolist()
         infos: dict[str, Any] = {}
-        for i in np.flatnonzero(mask).tolist():
-            _, info = self.envs[i].reset(seed=seeds[i], options=options[i])
+        for i, info in zip(which, self._begin(which, seeds, options), strict=True):
             infos = self._add_info(infos, info, i)
         if self._over is None:
             self._over = np.zeros(self.num_envs, dtype=bool)
@@ -112,12 +118,13 @@ class ShapeControlVectorEnv(VectorEnv):
                 ' reset(options={"reset_mask": ...}) first'
             )
         going = np.flatnonzero(~starting)
-        started = {int(i): self.envs[i].reset()[1] for i in np.flatnonzero(starting)}
+        started = np.flatnonzero(starting).tolist()
+        beginnings = self._begin(started)
         reasons = np.full(self.num_envs, "", dtype=object)
         twists = np.zeros((self.num_envs, self.config.n_clamps, 6))
         if len(going):
             moving = [self.envs[i] for i in going]
-            twists[going], reasons[going] = _advance(moving, actions[going])
+            twists[going], reasons[going] = _advance(moving, actions[going], self._threads)
         self._steps[going] += 1
         self._steps[starting] = 0
         terminations = reasons != ""
@@ -135,7 +142,7 @@ class ShapeControlVectorEnv(VectorEnv):
             termination_penalty=self.config.termination_penalty,
         )
         rewards[starting] = 0.0
-        for i, info in started.items():
+        for i, info in zip(started, beginnings, strict=True):
             infos = self._add_info(infos, info, i)
         self._over = over = terminations | truncations
         if self.autoreset_mode is AutoresetMode.SAME_STEP and over.any():
@@ -146,12 +153,27 @@ class ShapeControlVectorEnv(VectorEnv):
         return tuple(env.render() for env in self.envs)
 
     def close_extras(self, **kwargs: Any) -> None:
+        self._threads.close()
         for env in self.envs:
             env.close()
 
     def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any) -> Any:
         """As a single environment's."""
         return self.envs[0].compute_reward(achieved_goal, desired_goal, info)
+
+    def _begin(
+        self,
+        which: list[int],
+        seeds: Sequence[int | None] | None = None,
+        options: Sequence[dict[str, Any]] | None = None,
+    ) -> list[dict[str, Any]]:
+        """Start an episode in some of the environments; what each has to say."""
+
+        def begin(i: int) -> dict[str, Any]:
+            seed = None if seeds is None else seeds[i]
+            return self.envs[i].reset(seed=seed, options=None if options is None else options[i])[1]
+
+        return self._threads.map(begin, which)
 
     def _checked(self, actions: ArrayLike) -> Array:
         actions = np.asarray(actions, dtype=np.float64)
@@ -205,15 +227,16 @@ class ShapeControlVectorEnv(VectorEnv):
             last = {key: values[i] for key, values in observations.items()}
             info = {key: _plain(values[i]) for key, values in infos.items() if key[0] != "_"}
             final = self._add_info(final, {"final_obs": last, "final_info": info}, i)
-        for i in over:
-            _, info = self.envs[i].reset()
+        for i, info in zip(over, self._begin(over), strict=True):
             infos = self._add_info(infos, info, i)
         self._steps[over] = 0
         self._over = np.zeros(self.num_envs, dtype=bool)
         return self._observations(), final | infos
 
 
-def _advance(envs: Sequence[ShapeControlEnv], actions: Array) -> tuple[Array, list[str]]:
+def _advance(
+    envs: Sequence[ShapeControlEnv], actions: Array, threads: Threads
+) -> tuple[Array, list[str]]:
     """Step every cell; the motions made (n, k, 6) [m], [rad], and why episodes end."""
     cells = [env.cell for env in envs]
     clamps = np.stack([cell.boundary.clamps for cell in cells])
@@ -223,7 +246,7 @@ def _advance(envs: Sequence[ShapeControlEnv], actions: Array) -> tuple[Array, li
         asked = (BoundaryDisplacement(*twist) for twist in twists)
         now = [env.delayed(twist) for env, twist in zip(envs, asked, strict=True)]
         twists = np.stack([twist.vector for twist in now]).reshape(twists.shape)
-    reasons = tasks.advance_all(cells, twists, envs[0].config)
+    reasons = tasks.advance_all(cells, twists, envs[0].config, threads.map)
     for env, twist, boundary in zip(envs, twists, before, strict=True):
         if env.cell.boundary is boundary:  # refused
             twist[:] = 0.0

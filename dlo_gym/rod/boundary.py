@@ -1,6 +1,7 @@
 """What the grippers impose on the rod's ends."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from math import dist
 
 import numpy as np
@@ -30,10 +31,12 @@ class BoundaryPoses:
         if self.right is not None:
             object.__setattr__(self, "right", check_single_pose(self.right, "clamp right"))
 
-    @property
+    @cached_property
     def clamps(self) -> Array:
-        """(2, 4, 4) left then right, or (1, 4, 4) if the right end is free."""
-        return np.stack([self.left] if self.right is None else [self.left, self.right])
+        """(2, 4, 4) left then right, or (1, 4, 4) if the right end is free; not to be written."""
+        clamps = np.array([self.left] if self.right is None else [self.left, self.right])
+        clamps.flags.writeable = False
+        return clamps
 
     @property
     def distance(self) -> float:

@@ -116,11 +116,6 @@ class CosseratRod:
     def n_nodes(self) -> int:
         return self.n_elements + 1
 
-    @property
-    def path_dependent(self) -> bool:
-        """Whether its shape at rest depends on the way there: it yields, or can touch something."""
-        return self._motion.yields or self._contact.possible
-
     def apply_forces(self, forces: ArrayLike) -> None:
         """Dead loads (n_nodes, 3) [N] on the nodes beside the weight, from the next solve on.
 
@@ -135,6 +130,11 @@ class CosseratRod:
         weight = node_weights(self.properties, self.n_elements, self.gravity)
         self._arrays = self._arrays._replace(forces=weight + forces)
         self._system = self._system._replace(rod=self._arrays)
+
+    @property
+    def path_dependent(self) -> bool:
+        """Whether its shape at rest depends on the way there: it yields, or can touch something."""
+        return self._motion.yields or self._contact.possible
 
     def settle(self, boundary: BoundaryPoses, start: ArrayLike | None = None) -> RodState:
         """Find the equilibrium between clamps from afar.

@@ -121,12 +121,14 @@ def nearest_solution(T_base_flange, guess, joint_angles):
 
 @njit(cache=True)
 def follow_solutions(T_base_flange, guess, joint_angles):
-    """Update ``joint_angles`` (s, k, 6) with solutions for flange poses (s, k, 4, 4) along a way,
-    each nearest to the last one there was, the first to ``guess`` (k, 6) [rad]."""
+    """Update ``joint_angles`` (s, 2, 6) with solutions for flange poses (s, k, 4, 4) of the first k
+    arms along a way, each nearest to the last one there was, the first to ``guess`` (2, 6) [rad].
+    """
     last = guess.copy()
     for s in range(len(T_base_flange)):
+        joint_angles[s] = last
         nearest_solution(T_base_flange[s], last, joint_angles[s])
-        for side in range(len(last)):
+        for side in range(2):
             if joint_angles[s, side, 0] == joint_angles[s, side, 0]:
                 last[side] = joint_angles[s, side]
 

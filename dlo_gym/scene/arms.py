@@ -104,11 +104,8 @@ class DualArm:
     def follow(self, way: Array, guess: Array) -> Array:
         """Joint angles (s, 2, 6) [rad] along a way of clamps (s, k, 4, 4), each nearest to those
         before it, the first to ``guess`` (2, 6); NaN where an arm cannot reach its clamp."""
-        k = way.shape[1]
-        joint_angles = np.array(np.broadcast_to(guess, (len(way), 2, 6)))
-        held = np.empty((len(way), k, 6))
-        follow_solutions(np.ascontiguousarray(self.flange_in_base(way)), guess[:k], held)
-        joint_angles[:, :k] = held
+        joint_angles = np.empty((len(way), 2, 6))
+        follow_solutions(self.flange_in_base(way), guess, joint_angles)
         return joint_angles
 
     def forward_kinematics(self, joint_angles: ArrayLike) -> BoundaryPoses:

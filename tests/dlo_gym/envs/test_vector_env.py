@@ -71,6 +71,22 @@ def test_it_is_gymnasiums_own_vector_of_single_environments_to_the_last_bit(mode
     assert "overstretch" in ends or mode is AutoresetMode.SAME_STEP
 
 
+@pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
+def test_how_many_threads_does_not_show(mode):
+    results = []
+    for threads in (1, 4):
+        envs = make(mode, n=6, steps=4, threads=threads)
+        rng = np.random.default_rng(1)
+        results.append([envs.reset(seed=11)])
+        for _ in range(9):
+            results[-1].append(envs.step(rng.uniform(-1, 1, (6, 10))))
+            over = results[-1][-1][2] | results[-1][-1][3]
+            if mode is AutoresetMode.DISABLED and over.any():
+                results[-1].append(envs.reset(options={"reset_mask": over}))
+        envs.close()
+    assert_same(*map(tuple, results))
+
+
 def test_metadata_says_how_it_starts_over():
     for mode in MODES:
         assert make(mode, n=1).metadata["autoreset_mode"] is mode
@@ -107,6 +123,8 @@ def test_wrong_arguments_are_refused():
         make(AutoresetMode.NEXT_STEP, observation_mode="images")
     with pytest.raises(ValueError, match="num_envs"):
         make(AutoresetMode.NEXT_STEP, n=0)
+    with pytest.raises(ValueError, match="threads: expected at least 1, or None, got 0"):
+        make(AutoresetMode.NEXT_STEP, threads=0)
     envs = make(AutoresetMode.NEXT_STEP, n=2)
     with pytest.raises(ValueError, match="seed: expected one per environment, 2, got 3"):
         envs.reset(seed=[1, 2, 3])

@@ -7,7 +7,7 @@ from dlo_gym.exceptions import UnreachablePose
 from dlo_gym.geometry.se3 import exp_so3, pose
 from dlo_gym.rod.boundary import BoundaryPoses
 from dlo_gym.scene.arms import DualArm
-from dlo_gym.scene.clearance import clearance, segment_distances
+from dlo_gym.scene.clearance import CAPSULE_RADII, capsule_axes, clearance, segment_distances
 from dlo_gym.scene.ur5e import JOINT_LIMIT, ik_branches, link_frames, nearest_turn
 
 CLAMP_ALONG_X = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -178,3 +178,32 @@ def test_clearance_of_an_arm_out_of_reach_is_not_known():
     np.testing.assert_array_equal(unknown.to_table[1], [known.to_table[0], np.nan])
     np.testing.assert_array_equal(unknown.within_arm[1], [known.within_arm[0], np.nan])
     assert np.isnan(unknown.between_arms).tolist() == [False, True]
+
+
+def test_following_a_way_is_reaching_each_pose_from_the_last_one_that_was_reached():
+    arms, guess = DualArm(), DualArm().home
+    steps = np.linspace([0.0, 0.0, 0.0], [-0.5, 0.3, 0.1], 30)
+    steps[12] = [-3.0, 0.0, 0.0]  # out of the left arm's reach alone
+    way = np.repeat(arms.forward_kinematics(guess).clamps[None], len(steps), axis=0)
+    way[:, 0, :3, 3] += steps
+    followed = arms.follow(way, guess)
+    assert np.isnan(followed[12, 0]).all()
+    for clamps, joint_angles in zip(way, followed, strict=True):
+        np.testing.assert_array_equal(joint_angles, arms.reach(clamps, guess))
+        guess = np.where(np.isnan(joint_angles), guess, joint_angles)
+    alone = arms.follow(way[:, :1], arms.home)
+    np.testing.assert_array_equal(alone[:, 0], followed[:, 0])
+    np.testing.assert_array_equal(alone[:, 1], np.broadcast_to(arms.home[1], (len(way), 6)))
+
+
+def test_clearances_are_the_smallest_over_all_pairs_of_capsules():
+    rng = np.random.default_rng(7)
+    bases = DualArm().T_world_base
+    joint_angles = DualArm().home + rng.normal(0.0, 0.6, (200, 2, 6))
+    axes = capsule_axes(bases, joint_angles)
+    pairs = segment_distances(axes[:, 0, :, None], axes[:, 1, None])
+    gaps = pairs - CAPSULE_RADII[:, None] - CAPSULE_RADII
+    found = clearance(bases, joint_angles)
+    np.testing.assert_allclose(found.between_arms, gaps.min(axis=(1, 2)), atol=1e-14)
+    assert (found.smallest < 0.0).any()
+    assert (found.smallest > 0.0).any()
