@@ -216,6 +216,18 @@ def test_the_bar_hides_what_is_behind_and_above_it():
     env.close()
 
 
+def test_the_tracker_follows_the_cable_round_the_bar():
+    options = {"image_scale": 1 / 3, "renderer": "raster"}
+    env = gym.make("dlo_gym/WrapBarTracked-v0", **options).unwrapped
+    infos, _ = wrap(env, 0)
+    assert infos[-1]["success"]
+    errors = [info["tracking_ptp3d"] for info in infos]
+    assert 0.0 < np.mean(errors) < 5e-3
+    achieved = env.step(np.zeros(10))[0]["achieved_goal"]
+    assert achieved[0] == pytest.approx(infos[-1]["winding"], abs=0.1)
+    env.close()
+
+
 def test_randomized_cables_are_wound_too():
     env = make(randomization=Randomization(friction=(0.2, 0.5), youngs_modulus=(8e5, 1.2e6)))
     infos, _ = wrap(env, 1)
