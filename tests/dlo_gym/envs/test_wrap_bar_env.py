@@ -248,6 +248,9 @@ def test_randomized_cables_are_wound_too():
     infos, _ = wrap(env, 1)
     assert infos[-1]["success"]
     assert env.cell.rod._contact.friction == infos[0]["randomization"]["friction"]
+    _, info = env.reset(seed=2)
+    assert info["held_steps"] == 0
+    assert not info["success"]
 
 
 def test_vectors_of_it_are_gymnasiums_own():
