@@ -153,6 +153,8 @@ def test_rewards_count_missing_turns_touch_and_failure():
     np.testing.assert_allclose(
         env.compute_reward(achieved, goals, infos), [0.0, 0.0, -0.5, -0.1, -21.0]
     )
+    singles = [env.compute_reward(a, goal, info) for a, info in zip(achieved, infos, strict=True)]
+    np.testing.assert_array_equal(env.compute_reward(achieved, goals, infos), singles)
     sparse = make(reward="sparse")
     np.testing.assert_allclose(
         sparse.compute_reward(achieved, goals, infos), [0.0, 0.0, -1.0, -1.0, -21.0]
