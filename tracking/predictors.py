@@ -23,8 +23,7 @@ class RodPredictor:
     Args:
         properties: of the rod.
         n_nodes: of the centerline.
-        rod: a settled rod to go on with, among what it touches; one that touches
-            nothing if omitted.
+        rod: a settled rod to go on with, among what it touches; else one that touches nothing.
         memory: share of the difference between the given shape and the old equilibrium that is
             carried over, from 0 (the new equilibrium) to 1.
     """

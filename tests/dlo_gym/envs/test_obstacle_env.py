@@ -4,7 +4,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import dlo_gym  # noqa: F401
-from dlo_gym.envs import goals, tasks
+from dlo_gym.envs import goals, obstacle_course, tasks
 from dlo_gym.envs.obstacle_rows import obstacle_rows
 from dlo_gym.envs.randomization import Randomization
 from dlo_gym.exceptions import RenderingUnavailable
@@ -76,16 +76,28 @@ def test_the_first_obstacle_stands_in_the_straight_way_and_the_start_is_clear(to
         assert len(cell.obstacles) == len(start.rod.contact.obstacles)
 
 
-def test_a_way_round_was_simulated_and_ends_at_the_goal(monkeypatch):
-    env, way = make(), []
-    advance = tasks.advance
+@pytest.mark.parametrize(
+    ("touch", "careless"), [("forbidden", False), ("allowed", False), ("forbidden", True)]
+)
+def test_a_way_round_was_simulated_and_ends_at_the_goal(touch, careless, monkeypatch):
+    env, way = make(touch=touch, friction=0.2), []
+    advance, clear = tasks.advance, obstacle_course._clear
+    if careless:  # obstacles are placed beside the way's first step alone
+
+        def clear_of_the_first(cell, start, around, body, touch):
+            first = around._replace(
+                positions=around.positions[:1], joint_angles=around.joint_angles[:1]
+            )
+            return clear(cell, start, first, body, touch)
+
+        monkeypatch.setattr(obstacle_course, "_clear", clear_of_the_first)
 
     def recorded(cell, displacement, config):
         way.append((len(cell.obstacles), cell.stamp, displacement))
         return advance(cell, displacement, config)
 
     monkeypatch.setattr(tasks, "advance", recorded)
-    for seed in range(3):
+    for seed in range(5):
         way.clear()
         env.reset(seed=seed)
         last = max(i for i, (n, stamp, _) in enumerate(way) if n and stamp == 0.0)
@@ -316,8 +328,6 @@ def test_options_about_obstacles_need_some(options, said):
 
 
 def test_an_unsolvable_course_says_so(monkeypatch):
-    from dlo_gym.envs import obstacle_course
-
     monkeypatch.setattr(obstacle_course, "ATTEMPTS", 2)
     with pytest.raises(ValueError, match="no way round obstacles found in 2 attempts"):
         make(goal_distance=(2.0, 3.0)).reset(seed=0)

@@ -130,6 +130,53 @@ def test_images_show_the_past_and_the_rods_look_and_no_model_is_built_again():
     env.close()
 
 
+def test_every_setting_reaches_the_rod_and_the_compiled_model():
+    options = {"observation_mode": "images", "image_scale": 0.1, "renderer": "raster"}
+    env = gym.make(STATE_ID, randomization=EVERYTHING, **options)
+    for seed in range(2):
+        _, info = env.reset(seed=seed)
+        said, cell = info["randomization"], env.unwrapped.cell
+        rod, radius = cell.rod._arrays, said["radius"]
+        inertia = np.pi / 4 * radius**4
+        np.testing.assert_allclose(rod.bending[:, 0], said["youngs_modulus"] * inertia)
+        weight = said["density"] * np.pi * radius**2 * said["length"] * 9.81
+        assert -rod.forces[:, 2].sum() == pytest.approx(weight)
+        assert rod.rest_length.sum() == pytest.approx(said["length"])
+        np.testing.assert_allclose(
+            rod.rest_curvature[1:-1], np.tile(said["rest_curvature"], (49, 1))
+        )
+        model = cell._renderer.model
+        rod_geom = model.geom("rod_0").id
+        assert model.geom_size[rod_geom, 0] == pytest.approx(radius)
+        color = model.mat_rgba[model.geom_matid[rod_geom], :3]
+        np.testing.assert_allclose(color, said["rod_color"], rtol=1e-6)
+        for view, camera in zip(cell.views(), cell.cameras, strict=True):
+            away = np.linalg.norm(view.camera.centre - camera.centre)
+            index = cell.cameras.index(camera)
+            assert away == pytest.approx(np.linalg.norm(said["camera_translation"][index]))
+        assert len(env.unwrapped._commands) == said["arm_latency"]
+        assert cell._past.maxlen == 1 + said["camera_latency"]
+        lying = said["clutter"]
+        for k in range(3):
+            block, piece = (model.geom(f"clutter_{name}_{k}_0").id for name in ("block", "cable"))
+            assert model.geom_rgba[block, 3] == np.isfinite(lying["blocks"][k, 6])
+            assert model.geom_rgba[piece, 3] == np.isfinite(lying["cable_radii"][k])
+            if np.isfinite(lying["blocks"][k, 6]):
+                np.testing.assert_allclose(model.geom_pos[block], lying["blocks"][k, :3])
+    env.close()
+
+
+def test_clutter_is_seen_and_changes():
+    options = {"observation_mode": "images", "image_scale": 0.1, "renderer": "raster"}
+    env = gym.make(STATE_ID, randomization=Randomization(clutter=(2, 2)), **options)
+    plain, _ = gym.make(STATE_ID, **options).reset(seed=0)
+    first, _ = env.reset(seed=0)
+    second, _ = env.reset(seed=1)
+    assert (first["image_top"] != plain["image_top"]).any(axis=2).mean() > 0.005
+    assert (first["image_top"] != second["image_top"]).any()
+    env.close()
+
+
 def test_observers_are_told_of_cameras_that_stand_a_little_elsewhere():
     error = Randomization(camera_translation=(0.01, 0.01))
     options = {"observation_mode": "images", "image_scale": 0.2}

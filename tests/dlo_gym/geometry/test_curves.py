@@ -51,3 +51,15 @@ def test_parallel_transport_round_a_spherical_triangle_turns_by_its_area():
     first = np.column_stack([y, z, x])
     last = curves.parallel_transport(tangents, first)[-1]
     np.testing.assert_allclose(last[:, 0] @ first[:, 1], 1.0, atol=1e-9)  # an octant: pi / 2
+
+
+def test_the_angle_swept_round_an_axis_counts_turns_and_their_sense():
+    points, origin = helix(200) + np.array([1.0, 2.0, 3.0]), [1.0, 2.0, -7.0]
+    up = np.array([0.0, 0.0, 3.0])
+    assert curves.swept_angle(points, origin, up) == pytest.approx(4 * np.pi)
+    assert curves.swept_angle(points, origin, -up) == pytest.approx(-4 * np.pi)
+    assert curves.swept_angle(points[::-1], origin, up) == pytest.approx(-4 * np.pi)
+    assert curves.swept_angle(points, [9.0, 2.0, 3.0], up) == pytest.approx(0.0, abs=1e-12)
+    across = np.array([[-1.0, 0.1, 0.0], [1.0, 0.1, 5.0]])
+    half_turn = -2 * np.arctan(10.0)
+    assert curves.swept_angle(across, [0, 0, 0], up) == pytest.approx(half_turn)
