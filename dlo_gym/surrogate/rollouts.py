@@ -25,6 +25,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from dlo_gym.atomic_file import written_aside
 from dlo_gym.exceptions import DatasetError
 from dlo_gym.executor import run_tasks
+from dlo_gym.output_folder import check_resume
 from dlo_gym.surrogate.simulation import Rollouts, RolloutSettings, simulate_rollout
 
 SCHEMA = "dlo-rollouts/2"
@@ -177,6 +178,7 @@ def rollouts(
 
 def _open_dataset(out: Path, settings: RolloutSettings, resume: bool, overwrite: bool) -> Manifest:
     """The manifest to go on from, in a folder that exists."""
+    check_resume(resume=resume, overwrite=overwrite)
     if out.exists() and not out.is_dir():
         raise FileExistsError(f"{out} is a file; name a folder")
     if not out.exists() or not any(out.iterdir()):

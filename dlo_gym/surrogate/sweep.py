@@ -27,7 +27,7 @@ from dlo_gym.atomic_file import written_aside
 from dlo_gym.exceptions import DatasetError
 from dlo_gym.executor import run_tasks
 from dlo_gym.metrics import ptp_3d
-from dlo_gym.output_folder import check_output_folder
+from dlo_gym.output_folder import check_output_folder, check_resume
 from dlo_gym.surrogate.evaluation import recorded_moves
 from dlo_gym.surrogate.predictor import ShapePredictor
 from dlo_gym.surrogate.simulation import RolloutSettings, simulate_rollout
@@ -206,6 +206,7 @@ def score_markdown(cells: list[dict[str, Any]], names: list[str]) -> str:
 
 def _open_sweep(out: Path, description: dict[str, Any], *, resume: bool, overwrite: bool) -> None:
     """Leaves a folder whose parts, if any, belong to ``description``."""
+    check_resume(resume=resume, overwrite=overwrite)
     file = out / "sweep.json"
     if resume and file.exists():
         found = json.loads(file.read_text())

@@ -17,6 +17,7 @@ from dlo_gym.atomic_file import written_aside
 from dlo_gym.exceptions import DatasetError, MissingExtra, WeightsError
 from dlo_gym.geometry.se3 import Array, exp_so3, matrix_to_quaternion
 from dlo_gym.interrupts import deferred_interrupt
+from dlo_gym.output_folder import check_resume
 from dlo_gym.rod.boundary import BoundaryDisplacement
 from dlo_gym.surrogate.conditioning import N_GROUPS
 from dlo_gym.surrogate.evaluation import Score, evaluate_predictor, score_table
@@ -35,6 +36,10 @@ from dlo_gym.surrogate.network import DloNetwork, RelativeNetwork
 
 CHECKPOINT_EVERY = 500
 VALIDATION_SIZE = 4096
+# What a checkpoint holds.
+CHECKPOINT = {
+    "settings", "network", "best", "best_loss", "optimiser", "generator", "step_count", "history",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -180,19 +185,27 @@ class Trainer:
         """Goes on from what ``save`` wrote.
 
         Raises:
-            WeightsError: if the file is damaged.
+            WeightsError: if the file is damaged, or of another version or a network of other data.
             ValueError: if it was made with other settings.
         """
         try:
             content: dict[str, Any] = torch.load(file, weights_only=True)
         except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
             raise WeightsError(f"{file}: damaged checkpoint: {error}") from error
+        if not isinstance(content, dict) or set(content) != CHECKPOINT:
+            found = sorted(content) if isinstance(content, dict) else type(content).__name__
+            raise WeightsError(
+                f"{file}: checkpoint of another version: expected {sorted(CHECKPOINT)}, got {found}"
+            )
         if content["settings"] != asdict(self.settings):
             raise ValueError(
                 f"settings: {file} was made with {content['settings']}, got"
                 f" {asdict(self.settings)}; resume with the same settings"
             )
-        self.network.load_state_dict(content["network"])
+        try:
+            self.network.load_state_dict(content["network"])
+        except RuntimeError as error:
+            raise WeightsError(f"{file}: checkpoint of another network: {error}") from error
         self.optimiser.load_state_dict(content["optimiser"])
         self.generator.set_state(content["generator"])
         self.best, self.best_loss = content["best"], content["best_loss"]
@@ -260,8 +273,17 @@ def train_surrogate(
 
     Raises:
         FileExistsError: if OUT holds a training and neither resume nor overwrite was given.
+        FileNotFoundError: if there is nothing to resume.
         DatasetError: if the data are damaged or incomplete.
+        ValueError: on options that do not go together.
     """
+    check_resume(resume=resume, overwrite=overwrite)
+    if threads < 1:
+        raise ValueError(f"threads: expected at least 1, got {threads}")
+    if weights is not None and not evaluate:
+        raise ValueError("weights: training starts from none; pass --evaluate to score a file")
+    if evaluate and (resume or overwrite):
+        raise ValueError("evaluate: trains nothing; expected neither resume nor overwrite")
     console = Console()
     rollouts, manifest = load_rollouts(data)
     if evaluate:
@@ -273,10 +295,12 @@ def train_surrogate(
     checkpoint, metrics, file = (out / name for name in names)
     if any((out / name).exists() for name in names) and not (resume or overwrite):
         raise FileExistsError(f"{out} exists; pass --overwrite to start anew or --resume to go on")
-    out.mkdir(parents=True, exist_ok=True)
+    if resume and not checkpoint.exists():
+        raise FileNotFoundError(f"no checkpoint.pt in {out}; there is nothing to resume")
     torch.set_num_threads(threads)
     trainer = Trainer(rollouts, settings)
-    if resume and checkpoint.exists():
+    out.mkdir(parents=True, exist_ok=True)
+    if resume:
         trainer.load(checkpoint)
     else:
         for name in names:
