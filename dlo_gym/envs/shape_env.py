@@ -13,6 +13,7 @@ from dlo_gym.envs import tasks
 from dlo_gym.envs.actions import ClampAction
 from dlo_gym.envs.cell import Appearance, SimulatedCell, sample_occluder_paths
 from dlo_gym.envs.config import ShapeEnvConfig
+from dlo_gym.envs.episode_viewer import EpisodeViewer
 from dlo_gym.envs.observers import make_observer
 from dlo_gym.envs.randomization import believed_cameras, randomized_properties
 from dlo_gym.exceptions import TrackLost
@@ -114,11 +115,20 @@ class ShapeControlEnv(gym.Env):
     Every field of `ShapeEnvConfig`, e.g.
     `gym.make("dlo_gym/ShapeControl-v0", goal_distance=(0.06, 0.1), reward="sparse")`.
 
+    ## Rendering
+    `render_mode="rgb_array"`: `render()` returns the views side by side, the goal drawn in;
+    `"rgb_array_list"` (by `gym.make`): those since the last call. `"human"`: every step appears in
+    the rerun viewer (`pip install 'dlo-gym[view]'`): cable, goal, arms, cameras with their images;
+    with `render_file="episodes.rrd"` it goes to a file for the viewer, which needs no display.
+
     ## Version History
     * v0: first version.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": 10,
+    }
 
     def __init__(self, render_mode: str | None = None, **options: Any) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -137,6 +147,7 @@ class ShapeControlEnv(gym.Env):
             control_step=config.control_step,
         )
         self._observer = make_observer(config.observer, config.observer_options)
+        self._viewer: EpisodeViewer | None = None
         self._estimate: ShapeEstimate | None = None
         self._goal: Array | None = None
         self._commands: deque[BoundaryDisplacement] = deque()
@@ -197,6 +208,10 @@ class ShapeControlEnv(gym.Env):
         info = self._info(BoundaryDisplacement.zero(self.config.n_clamps), "")
         if randomized is not None:
             info["randomization"] = randomized
+        if self.render_mode == "human":
+            self._viewer = self._viewer or EpisodeViewer(self.cell, self.config.render_file)
+            self._viewer.begin(goal)
+            self._viewer.show(self.estimate, info["shape_error"], "")
         return self._observation(), info
 
     def step(
@@ -216,6 +231,8 @@ class ShapeControlEnv(gym.Env):
         reward = self.compute_reward(
             observation["achieved_goal"], observation["desired_goal"], info
         )
+        if self._viewer is not None:
+            self._viewer.show(self.estimate, info["shape_error"], termination)
         return observation, float(reward), bool(termination), False, info
 
     def delayed(self, displacement: BoundaryDisplacement) -> BoundaryDisplacement:
@@ -257,7 +274,12 @@ class ShapeControlEnv(gym.Env):
         return action.astype(np.float32)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """All views side by side, with goal and estimate drawn in, or None without render mode."""
+        """All views side by side, with goal and estimate drawn in.
+
+        None without render mode, and in mode ``"human"``, where every step shows itself.
+        """
+        if self.render_mode == "human":
+            return None
         if self.render_mode is None:
             gym.logger.warn(
                 "render() was called without a render mode; pass render_mode='rgb_array' to make"
@@ -280,6 +302,9 @@ class ShapeControlEnv(gym.Env):
         return np.hstack([image[:height] for image in images])
 
     def close(self) -> None:
+        if self._viewer is not None:
+            self._viewer.close()
+        self._viewer = None
         self._observer.close()
         self.cell.close()
 

@@ -50,6 +50,10 @@ class ShapeControlVectorEnv(VectorEnv):
         if num_envs < 1:
             raise ValueError(f"num_envs: expected at least 1, got {num_envs}")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
+        if render_mode == "human":
+            raise ValueError(
+                "render_mode: expected None or 'rgb_array' of many environments, got 'human'"
+            )
         self.envs = [ShapeControlEnv(render_mode, **options) for _ in range(num_envs)]
         first = self.envs[0]
         self.config = first.config

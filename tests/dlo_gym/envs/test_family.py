@@ -3,7 +3,6 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import dlo_gym
 from dlo_gym.envs import tasks
@@ -29,23 +28,23 @@ def opengl():
 
 
 @pytest.mark.parametrize("task", TASKS[1:])
-def test_both_checkers_find_nothing(task, opengl):
+def test_both_checkers_find_nothing(task, opengl, gym_check):
+    gym_check(f"dlo_gym/ShapeControl{task}-v0", image_scale=0.1)
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(make(task, image_scale=0.1).unwrapped)
         checker.check_env(make(task).unwrapped)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("observed", ["Tracked", "Images"])
-def test_both_checkers_find_nothing_in_what_sees_images(task, observed, opengl):
+def test_both_checkers_find_nothing_in_what_sees_images(task, observed, opengl, gym_check):
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     options = {"image_scale": 0.1} if observed == "Images" else {}
+    gym_check(f"dlo_gym/ShapeControl{task}{observed}-v0", **options)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(make(task + observed, **options).unwrapped)
         checker.check_env(make(task + observed, **options).unwrapped)
 
 
@@ -162,13 +161,3 @@ def test_a_vector_of_them_is_each_of_them(task):
 def test_options_that_contradict_each_other_are_refused(options, said):
     with pytest.raises(ValueError, match=said):
         make("", **options)
-
-
-def test_the_images_of_an_episode_come_as_a_list(opengl):
-    env = make("Planar", render_mode="rgb_array_list", image_scale=0.1)
-    env.reset(seed=0)
-    env.step(np.zeros(6))
-    images = env.render()
-    assert len(images) == 2
-    assert images[0].shape == images[1].shape == (108, 384, 3)
-    env.close()
