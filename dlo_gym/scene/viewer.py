@@ -84,8 +84,6 @@ class SceneViewer:
             fill_mode="solid",
         )
         self._log("world/table", table, static=True)
-        for side in SIDES:
-            self._log(f"world/grippers/{side}", rr.TransformAxes3D(AXIS), static=True)
 
     def set_time(self, stamp: float) -> None:
         """What is shown from now on, is so at ``stamp`` [s]."""
@@ -133,6 +131,7 @@ class SceneViewer:
         for side, clamp in zip(SIDES, boundary.clamps, strict=False):
             pose = self._rr.Transform3D(translation=clamp[:3, 3], mat3x3=clamp[:3, :3])
             self._log(f"world/grippers/{side}", pose)
+            self._log(f"world/grippers/{side}", self._rr.TransformAxes3D(AXIS))
 
     def show_arms(self, joint_angles: Array) -> None:
         """The links at joint angles (2, 6) [rad], as the capsules that keep their distance."""
