@@ -123,6 +123,21 @@ def test_one_arm_holds_a_rod_whose_other_end_hangs_free():
     np.testing.assert_allclose(info["displacement"], np.eye(12)[0] * 0.01, atol=1e-12)
 
 
+def test_one_arm_is_tracked_with_the_rod_as_predictor(opengl):
+    env = make("OneArmTracked", image_scale=1 / 3)
+    env.reset(seed=7)
+    errors = []
+    for _ in range(12):
+        *_, info = env.step(np.array([0.5, 0.5, 1.0, 0.5, -0.5], np.float32))
+        errors.append(info["tracking_ptp3d"])
+    assert max(errors) < 2e-3
+    env.close()
+    network = make("OneArmTracked", observer_options={"predictor": "network"})
+    with pytest.raises(ValueError, match="predictor: expected rod .* free, got network"):
+        network.reset(seed=7)
+    network.close()
+
+
 def test_one_arm_takes_one_clamp_and_a_free_goal():
     env = make("OneArm").unwrapped
     env.reset(seed=1)
