@@ -14,7 +14,7 @@ export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 export MUJOCO_GL ?= egl
 
-.PHONY: demo demo-robot test test-all bench validation soak lint clean egl
+.PHONY: demo demo-robot test test-all bench validation pictures soak lint clean egl
 
 demo: $(VENV)/.base egl
 	$(BIN)/dlo demo --out $(OUT) --overwrite
@@ -33,6 +33,9 @@ bench: $(VENV)/.all egl
 
 validation: $(VENV)/.all
 	$(BIN)/python -m benchmarks.validation
+
+pictures: $(VENV)/.all egl
+	$(BIN)/python -m benchmarks.pictures
 
 soak: $(VENV)/.all egl
 	$(BIN)/python -m benchmarks.soak_robot --minutes 30

@@ -5,7 +5,7 @@ from argparse import ArgumentParser
 import gymnasium as gym
 import numpy as np
 
-from control.controller import ControlDiagnostics, Controller
+from control.controller import Controller
 from control.evaluate import (
     episode_metrics,
     gate_for,
@@ -15,29 +15,6 @@ from control.evaluate import (
 )
 from control.safety import SafetyGate
 from dlo_gym.envs.shape_env import ShapeControlEnv
-from dlo_gym.geometry.se3 import Array
-from dlo_gym.rod import BoundaryDisplacement, BoundaryPoses, RodProperties
-from dlo_gym.rod.state import ShapeEstimate
-
-
-class StraightServo:
-    """Moves both clamps straight to the goal's ends and tangents, blind to what is in between."""
-
-    diagnostics = ControlDiagnostics()
-
-    def reset(self, goal: Array, boundary: BoundaryPoses, properties: RodProperties) -> None:
-        pass
-
-    def control(
-        self, estimate: ShapeEstimate, boundary: BoundaryPoses, goal: Array
-    ) -> BoundaryDisplacement:
-        ends = ((goal[0], goal[1] - goal[0]), (goal[-1], goal[-1] - goal[-2]))
-        twists = []
-        for clamp, (position, tangent) in zip(boundary.clamps, ends, strict=False):
-            turn = np.cross(clamp[:3, 2], tangent / np.linalg.norm(tangent))
-            twists.append(np.concatenate([position - clamp[:3, 3], turn]))
-        largest = max(np.abs(twist[:3]).max() for twist in twists)
-        return BoundaryDisplacement(*twists).scaled(0.01 / max(largest, 0.01))
 
 
 def bare_episode(env: gym.Env, driver: Controller, seed: int) -> tuple[float, str]:
@@ -62,7 +39,9 @@ def final_metrics(
 
 def main() -> None:
     parser = ArgumentParser(description=__doc__)
-    parser.add_argument("--tasks", nargs="+", default=["Easy", "", "Medium", "Hard"])
+    parser.add_argument(
+        "--tasks", nargs="+", default=["Easy", "", "Medium", "Hard", "Planar", "OneArm"]
+    )
     parser.add_argument("--episodes", type=int, default=5)
     arguments = parser.parse_args()
     for task in arguments.tasks:
@@ -70,9 +49,7 @@ def main() -> None:
         config = env.unwrapped.config  # type: ignore[attr-defined]
         gate = gate_for(config)
         for name in ("bare servo", "servo", "mpc"):
-            driver: Controller = StraightServo()
-            if name == "mpc":
-                driver = make_controller("mpc", gate.limits, config)
+            driver = make_controller(name.removeprefix("bare "), gate.limits, config)
             episodes = [
                 bare_episode(env, driver, seed)
                 if name == "bare servo"

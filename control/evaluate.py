@@ -19,10 +19,12 @@ from rich.table import Table
 
 import dlo_gym  # noqa: F401  (registers the environments)
 from control.controller import Controller
-from control.models import RodModel, SurrogateModel
+from control.models import HorizonModel, RodModel, SurrogateModel
 from control.mpc import ShapeMPC
 from control.policy import PolicyController
+from control.problem import MpcConfig
 from control.safety import SafetyGate, SafetyLimits
+from control.servo import EndServo
 from dlo_gym.envs.config import ShapeEnvConfig
 from dlo_gym.envs.shape_env import ShapeControlEnv
 from dlo_gym.exceptions import SafetyStop, SolverFailed
@@ -82,11 +84,11 @@ def gate_for(config: ShapeEnvConfig) -> SafetyGate:
 
     It knows the arms exactly if the environment does (``check_arms``).
     """
+    axes, turns = (2.0, 1.0) if config.planar else (3.0, 3.0 if config.axial_rotation else 2.0)
     return SafetyGate(
         SafetyLimits(
-            max_translation_step=sqrt(3.0) * config.max_translation_step,
-            max_rotation_step=sqrt(3.0 if config.axial_rotation else 2.0)
-            * config.max_rotation_step,
+            max_translation_step=sqrt(axes) * config.max_translation_step,
+            max_rotation_step=sqrt(turns) * config.max_rotation_step,
             control_period=config.control_step,
             rod_length=config.properties.length,
             overstretch_margin=1.0 - config.max_stretch + STRETCH_RESERVE,
@@ -218,10 +220,10 @@ def overall_metrics(episodes: Sequence[Sequence[Step]]) -> dict[str, Any]:
 
 def control(
     *,
-    controller: Literal["mpc", "rl"] = "mpc",
+    controller: Literal["mpc", "servo", "rl"] = "mpc",
     env: str = "dlo_gym/ShapeControl-v0",
     observer: Literal["state", "tracked"] | None = None,
-    model: Literal["surrogate", "rod"] = "surrogate",
+    model: Literal["surrogate", "rod"] | None = None,
     episodes: int = 5,
     seed: int = 0,
     max_steps: int | None = None,
@@ -237,11 +239,13 @@ def control(
     after every episode, so that an interrupted run loses nothing that was finished.
 
     Args:
-        controller: mpc, or rl for a trained policy.
+        controller: mpc; servo, which moves the grippers straight to the goal's ends; or rl for a
+            trained policy.
         env: id of a shape-control environment.
         observer: state for the simulator's own state, tracked for the tracker on rendered views;
             what the environment id says when omitted.
-        model: what the MPC plans on: the trained surrogate, or the rod itself.
+        model: what the MPC plans on: the trained surrogate, or the rod itself; the surrogate when
+            omitted, but the rod where its right end is free.
         episodes: how many.
         seed: of the first episode; each next one takes the next seed.
         max_steps: per episode; the environment's time limit when omitted.
@@ -261,6 +265,8 @@ def control(
         raise ValueError(f"max_steps: expected at least 1, got {max_steps}")
     if policy is not None and controller != "rl":
         raise ValueError(f"policy: the {controller} controller takes none; pass --controller rl")
+    if model is not None and controller != "mpc":
+        raise ValueError(f"model: the {controller} controller takes none; pass --controller mpc")
     check_output_folder(out, ("metrics.json*",), overwrite=overwrite)
     existed = out.exists()
     finished: list[list[Step]] = []
@@ -272,7 +278,7 @@ def control(
         out.mkdir(parents=True, exist_ok=True)
         settings = {"controller": controller, "env": env, "observer": config.observer, "seed": seed}
         if controller == "mpc":
-            settings["model"] = model
+            settings["model"] = model or default_model(config)
         console = Console()
         with Progress(console=console, transient=True) as progress:
             task = progress.add_task("episodes", total=episodes)
@@ -314,7 +320,7 @@ def play_episode(
     env: str,
     observer: str | None,
     controller: str,
-    model: str,
+    model: str | None,
     policy: Path | None,
     max_steps: int | None,
     seed: int,
@@ -342,7 +348,7 @@ def make_env(name: str, observer: str | None = None, **options: Any) -> gym.Env:
         options["observer"] = OBSERVERS[observer]
     try:
         return gym.make(name, **options)
-    except (gym.error.Error, ModuleNotFoundError) as error:
+    except (gym.error.Error, ModuleNotFoundError, TypeError) as error:  # TypeError: of its options
         shipped = [known for known in gym.registry if known.startswith("dlo_gym/")]
         raise ValueError(
             f"env: cannot make {name!r}: {error}; this package has {', '.join(shipped)}"
@@ -354,26 +360,67 @@ def make_controller(
     limits: SafetyLimits,
     config: ShapeEnvConfig,
     *,
-    model: str = "surrogate",
+    model: str | None = None,
     policy: Path | None = None,
 ) -> Controller:
-    """The controller ``name``: ``"mpc"`` on ``model``, or ``"rl"`` with the file ``policy``.
+    """The controller ``name`` for environments with ``config``.
+
+    Args:
+        name: ``"mpc"``, ``"servo"`` or ``"rl"``.
+        limits: of the safety gate.
+        config: of the environment.
+        model: ``"surrogate"`` or ``"rod"``, for the MPC; ``default_model(config)`` when omitted.
+        policy: file of the trained policy, for ``"rl"``.
 
     Raises:
-        ValueError: on an unknown name, or if ``rl`` comes without a policy.
+        ValueError: on an unknown name, if ``rl`` comes without a policy, or if model or policy are
+            not for such a rod and such grippers.
         WeightsError: if the weights of the surrogate or the policy are missing or damaged.
     """
     if name == "mpc":
-        if model == "rod":
-            return ShapeMPC(RodModel(config.n_elements), limits)
-        from dlo_gym.surrogate.predictor import ShapePredictor
-
-        return ShapeMPC(SurrogateModel(ShapePredictor.load()), limits)
+        settings = MpcConfig(n_clamps=config.n_clamps, planar=config.planar)
+        return ShapeMPC(_model(model or default_model(config), config), limits, settings)
+    if name == "servo":
+        return EndServo(limits)
     if name == "rl":
         if policy is None:
             raise ValueError("policy: the rl controller needs the file of a trained policy")
-        return PolicyController(policy)
-    raise ValueError(f"controller: expected mpc or rl, got {name!r}")
+        controller = PolicyController(policy)
+        moves = {"n_clamps": config.n_clamps, "planar": config.planar}
+        for what, expected in moves.items():
+            if (got := getattr(controller.policy.action, what)) != expected:
+                raise ValueError(
+                    f"policy: {policy}: expected one with {what} {expected}, as the environment"
+                    f" has, got {got}"
+                )
+        return controller
+    raise ValueError(f"controller: expected mpc, servo or rl, got {name!r}")
+
+
+def default_model(config: ShapeEnvConfig) -> str:
+    """What the MPC plans on where nothing else is asked for."""
+    return "rod" if config.free_end else "surrogate"
+
+
+def _model(name: str, config: ShapeEnvConfig) -> HorizonModel:
+    if name == "rod":
+        return RodModel(config.n_elements)
+    if name != "surrogate":
+        raise ValueError(f"model: expected surrogate or rod, got {name!r}")
+    if config.free_end:
+        raise ValueError(
+            "model: expected rod where the right end is free, got surrogate, which knows rods"
+            " held at both ends"
+        )
+    from dlo_gym.surrogate.predictor import ShapePredictor
+
+    predictor = ShapePredictor.load()
+    if predictor.n_nodes != config.n_nodes:
+        raise ValueError(
+            f"model: expected rod for a rod of n_elements {config.n_elements}, got surrogate,"
+            f" which knows {predictor.n_nodes - 1} elements"
+        )
+    return SurrogateModel(predictor)
 
 
 def write_metrics(path: Path, metrics: dict[str, Any]) -> None:

@@ -25,8 +25,8 @@ class Rollout(NamedTuple):
 class HorizonModel(Protocol):
     """A model of the rod, with derivatives.
 
-    The same ``directions`` (12, m) map each step's decisions to its displacement (12,), world
-    axes, left then right.
+    The same ``directions`` (6 k, m) map each step's decisions to its displacement (6 k,), world
+    axes, left then right, of the k clamps that hold the rod.
     """
 
     @property
@@ -90,7 +90,16 @@ class SurrogateModel:
         return self.predictor.n_nodes
 
     def reset(self, boundary: BoundaryPoses, properties: RodProperties) -> None:
-        """Takes the predictor for this rod; the clamps it knows from the centerline."""
+        """Takes the predictor for this rod; the clamps it knows from the centerline.
+
+        Raises:
+            ValueError: if the right end is free.
+        """
+        if boundary.right is None:
+            raise ValueError(
+                "model: the surrogate knows rods held at both ends, got a free right end; plan on"
+                " the rod"
+            )
         self.predictor = self.predictor.for_rod(properties)
 
     def step(
@@ -167,7 +176,7 @@ class RodModel:
         N, m = plan.shape
         n = self.n_nodes
         shapes, jacobians = np.empty((N, n, 3)), np.zeros((N, 3 * n, N * m))
-        twists = np.zeros((12, N * m))
+        twists = np.zeros((len(directions), N * m))
         try:
             for k, decisions in enumerate(plan):
                 vector = directions @ decisions
@@ -175,7 +184,8 @@ class RodModel:
                 twists = _carried(twists, vector)
                 twists[:, k * m : (k + 1) * m] = _left_jacobian(vector) @ directions
                 shapes[k] = centerline + moved - start.positions + (k + 1) * disturbance
-                jacobians[k] = rod.sensitivity().reshape(3 * n, 12) @ twists
+                sensitivity = rod.sensitivity().reshape(3 * n, 12)[:, : len(directions)]
+                jacobians[k] = sensitivity @ twists
         finally:
             rod.restore(start)
         return Rollout(shapes, jacobians)
@@ -191,20 +201,21 @@ class RodModel:
 
 
 def _carried(twists: Array, vector: Array) -> Array:
-    """Small motions (12, k) of the clamps as they appear after the displacement ``vector``."""
+    """Small motions (6 k, m) of the clamps as they appear after the displacement ``vector``."""
     carried = twists.copy()
-    for rows in (slice(3, 6), slice(9, 12)):
+    for first in range(3, len(vector), 6):
+        rows = slice(first, first + 3)
         carried[rows] = exp_so3(vector[rows]) @ twists[rows]
     return carried
 
 
 def _left_jacobian(vector: Array) -> Array:
-    """d(clamp motion)/d(displacement), (12, 12), at the displacement ``vector`` (12,).
+    """d(clamp motion)/d(displacement), (6 k, 6 k), at the displacement ``vector`` (6 k,).
 
     The rotation blocks are the left Jacobian of SO(3): exp(w + d) = exp(J d) exp(w).
     """
-    jacobian = np.eye(12)
-    for i in (3, 9):
+    jacobian = np.eye(len(vector))
+    for i in range(3, len(vector), 6):
         w = vector[i : i + 3]
         angle = float(np.linalg.norm(w))
         skew = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])

@@ -7,7 +7,7 @@ import numpy as np
 
 from control.controller import ControlDiagnostics
 from control.models import HorizonModel, Rollout
-from control.problem import N_DECISIONS, MpcConfig, Plan, ShapeProblem, step_directions
+from control.problem import MpcConfig, Plan, ShapeProblem, step_directions
 from control.safety import SafetyLimits
 from dlo_gym.exceptions import DloError, SolverFailed
 from dlo_gym.geometry.se3 import Array
@@ -20,7 +20,7 @@ OVERSTRETCH_PRICE = 1e4
 
 
 class ShapeMPC:
-    """Moves both grippers so that the rod takes a goal shape.
+    """Moves the grippers so that the rod takes a goal shape.
 
     At every control step the plan of the last one, shifted, is linearised on the model and one QP
     gives the correction (real-time iteration: Diehl, Bock, Schloeder 2005). The error between the
@@ -45,8 +45,7 @@ class ShapeMPC:
         self.model = model
         self.limits = limits or SafetyLimits()
         self.config = config or MpcConfig()
-        n_rows = 7 * self.config.horizon
-        n = self.config.horizon * N_DECISIONS
+        n, n_rows = self.config.horizon * self.config.n_decisions, self.config.n_constraints
         structure = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(n_rows, n)}
         quiet = {"osqp": {"osqp": {"verbose": False}}, "qpoases": {"printLevel": "none"}}
         options = {"error_on_fail": False, **quiet.get(self.config.qp_solver, {})}
@@ -54,7 +53,7 @@ class ShapeMPC:
         self._forget()
 
     def _forget(self) -> None:
-        self._plan = np.zeros((self.config.horizon, N_DECISIONS))
+        self._plan = np.zeros((self.config.horizon, self.config.n_decisions))
         self._disturbance = np.zeros((self.model.n_nodes, 3))
         self._last: tuple[Array, BoundaryPoses] | None = None
         self._failures = 0
@@ -73,12 +72,14 @@ class ShapeMPC:
         """Starts an episode.
 
         Raises:
-            ValueError: if the goal has another number of nodes than the model, or its ends are
-                further apart than the rod is long.
+            ValueError: if the goal has another number of nodes than the model, its ends are
+                further apart than the rod is long, or another number of clamps holds the rod than
+                the configuration says.
         """
         self._checked_goal(goal)
+        self._check_clamps(boundary)
         span = float(np.linalg.norm(goal[-1] - goal[0]))
-        if not span < properties.length:
+        if boundary.right is not None and not span < properties.length:
             raise ValueError(
                 f"goal: overstretched: its ends are {span:.4f} m apart, the rod is"
                 f" {properties.length:.4f} m long"
@@ -93,13 +94,12 @@ class ShapeMPC:
 
         Raises:
             SolverFailed: after ``max_failures`` steps in a row without a solution.
-            ValueError: if goal or estimate have another number of nodes than the model, or only
-                one clamp holds the rod.
+            ValueError: if goal or estimate have another number of nodes than the model, or another
+                number of clamps holds the rod than the configuration says.
         """
         started = perf_counter()
         goal = self._checked_goal(goal)
-        if boundary.right is None:
-            raise ValueError("boundary: the shape MPC moves two clamps, got a free right end")
+        self._check_clamps(boundary)
         if estimate.centerline.shape != goal.shape:
             raise ValueError(
                 f"estimate: expected a centerline of shape {goal.shape},"
@@ -121,7 +121,7 @@ class ShapeMPC:
         return BoundaryDisplacement.from_vector(problem.directions @ plan.decisions[0])
 
     def solve(self, problem: ShapeProblem, start: Array, iterations: int | None = None) -> Plan:
-        """Gauss-Newton iterations on ``problem`` from the plan ``start`` (N, 10).
+        """Gauss-Newton iterations on ``problem`` from the plan ``start`` (N, m).
 
         An iteration that has made the cost worse is undone and repeated with more damping
         (Levenberg-Marquardt). With one iteration there is nothing to compare, and no cost for it.
@@ -155,7 +155,7 @@ class ShapeMPC:
     def _solve_qp(
         self, problem: ShapeProblem, plan: Array, rollout: Rollout, damping: float
     ) -> Array:
-        """The correction (N, 10) of ``plan``."""
+        """The correction (N, m) of ``plan``."""
         N, flat = len(plan), plan.ravel()
         weights = problem.shape_weights.reshape(-1)
         jacobian = rollout.jacobians.reshape(-1, flat.size)
@@ -167,12 +167,14 @@ class ShapeMPC:
         gradient = 2.0 * weighted.T @ errors + regular @ flat + problem.decision_gradient
         rows = problem.constraints(plan)
         reached = rows.matrix @ flat
+        # In steps, not metres: solvers' tolerances are meant for numbers of about 1.
+        step = problem.limits.translation_step
         solution = self._qp(
             h=hessian,
             g=gradient,
-            a=rows.matrix,
-            lba=rows.lower - reached,
-            uba=rows.upper - reached,
+            a=rows.matrix / step,
+            lba=(rows.lower - reached) / step,
+            uba=(rows.upper - reached) / step,
             lbx=-1.0 - flat,
             ubx=1.0 - flat,
         )
@@ -189,7 +191,7 @@ class ShapeMPC:
         """This step's problem, after the disturbance estimate took in the last step's error."""
         floor = self.config.confidence_floor
         weights = floor + (1.0 - floor) * np.clip(estimate.confidence, 0.0, 1.0)
-        previous = np.zeros(12)
+        previous = np.zeros(6 * self.config.n_clamps)
         if self._last is not None:
             last_centerline, last_boundary = self._last
             made = last_boundary.displacement_to(boundary)
@@ -197,7 +199,7 @@ class ShapeMPC:
             if estimate.seen and self.config.disturbance_gain > 0.0:
                 predicted = self.model.step(last_centerline, last_boundary, made)
                 self._filter_disturbance(estimate.centerline - predicted, estimate.confidence)
-        directions = step_directions(boundary, self.limits)
+        directions = step_directions(boundary, self.limits, self.config.planar)
         scales = np.square(directions).sum(axis=0)
         return ShapeProblem(
             centerline=estimate.centerline,
@@ -227,7 +229,14 @@ class ShapeMPC:
             raise SolverFailed(
                 f"no solution in {self._failures} control steps in a row; the last: {error}"
             ) from error
-        return BoundaryDisplacement.zero()
+        return BoundaryDisplacement.zero(self.config.n_clamps)
+
+    def _check_clamps(self, boundary: BoundaryPoses) -> None:
+        if len(boundary.clamps) != self.config.n_clamps:
+            raise ValueError(
+                f"boundary: expected {self.config.n_clamps} clamps, as the MPC's n_clamps says,"
+                f" got {len(boundary.clamps)}"
+            )
 
     def _checked_goal(self, goal: Array) -> Array:
         goal = np.asarray(goal, dtype=np.float64)

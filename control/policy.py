@@ -11,6 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from control.controller import ControlDiagnostics
+from dlo_gym.atomic_file import written_aside
 from dlo_gym.envs.actions import ClampAction, clamp_numbers
 from dlo_gym.exceptions import WeightsError
 from dlo_gym.geometry.se3 import Array
@@ -91,15 +92,18 @@ class Policy:
         return np.tanh(self.weights[-1] @ hidden + self.biases[-1])
 
     def save(self, path: Path, **description: str) -> None:
-        """Writes safetensors with ``description`` as metadata; replaces the file in one step."""
+        """Writes safetensors with ``description`` as metadata; replaces the file in one step.
+
+        Raises:
+            WeightsError: if it cannot be written.
+        """
         tensors = {}
         for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             tensors[f"weight_{index}"] = np.ascontiguousarray(weight)
             tensors[f"bias_{index}"] = np.ascontiguousarray(bias)
         metadata = {"format": FORMAT, "action": json.dumps(asdict(self.action)), **description}
-        part = path.with_suffix(".part")
-        save_file(tensors, part, metadata)
-        part.replace(path)
+        with written_aside(path, WeightsError) as part:
+            save_file(tensors, part, metadata)
 
     @classmethod
     def load(cls, path: Path) -> "Policy":
@@ -127,6 +131,9 @@ class Policy:
             biases = [tensors[f"bias_{index}"] for index in range(n_layers)]
         except (KeyError, TypeError, ValueError) as error:
             raise WeightsError(f"policy {path}: incomplete: {error!r}") from error
+        if {weight.ndim for weight in weights} != {2} or {bias.ndim for bias in biases} != {1}:
+            shapes = {name: tensor.shape for name, tensor in tensors.items()}
+            raise WeightsError(f"policy {path}: expected matrices and their biases, got {shapes}")
         sizes = [weight.shape[1] for weight in weights] + [action.size]
         expected = [6 * N_POINTS + N_CLAMPS] + [len(bias) for bias in biases]
         finite = all(np.isfinite(tensor).all() for tensor in tensors.values())
@@ -157,17 +164,23 @@ class PolicyController:
         return self._diagnostics
 
     def reset(self, goal: Array, boundary: BoundaryPoses, properties: RodProperties) -> None:
+        """Starts an episode.
+
+        Raises:
+            ValueError: if the policy moves another number of clamps than hold the rod.
+        """
+        if len(boundary.clamps) != self.policy.action.n_clamps:
+            raise ValueError(
+                f"policy: expected one for the {len(boundary.clamps)} clamps that hold the rod,"
+                f" got one that moves {self.policy.action.n_clamps}"
+            )
         self._diagnostics = ControlDiagnostics()
 
     def control(
         self, estimate: ShapeEstimate, boundary: BoundaryPoses, goal: Array
     ) -> BoundaryDisplacement:
-        inputs = np.concatenate(
-            [
-                sample_points(estimate.centerline),
-                sample_points(goal),
-                clamp_numbers(boundary.left),
-                clamp_numbers(boundary.right),
-            ]
-        )
+        held = np.zeros(N_CLAMPS)  # of a free right end nothing
+        numbers = np.concatenate([clamp_numbers(clamp) for clamp in boundary.clamps])
+        held[: len(numbers)] = numbers
+        inputs = np.concatenate([sample_points(estimate.centerline), sample_points(goal), held])
         return self.policy.action.to_displacement(self.policy(inputs), boundary)

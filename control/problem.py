@@ -1,18 +1,16 @@
 """The optimal control problem that the shape MPC solves at every control step."""
 
 from dataclasses import dataclass
-from math import isfinite
+from math import isfinite, sqrt
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from control.safety import SafetyLimits
+from dlo_gym.envs.actions import ClampAction
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryPoses
-
-# Decisions of one step: per gripper a translation along the world axes and a rotation about d1, d2.
-N_DECISIONS = 10
 
 
 @dataclass(frozen=True)
@@ -23,6 +21,8 @@ class MpcConfig:
     step, so the weights have no unit.
 
     Attributes:
+        n_clamps: grippers that move: 2, or 1 where the right end is free.
+        planar: whether they stay in the plane of world x and z.
         horizon: N, number of control steps planned ahead.
         iterations: Gauss-Newton iterations per control step.
         error_scale: node error that costs 1 [m].
@@ -41,6 +41,8 @@ class MpcConfig:
         ValueError: naming the setting.
     """
 
+    n_clamps: int = 2
+    planar: bool = False
     horizon: int = 5
     iterations: int = 1
     error_scale: float = 0.01
@@ -56,6 +58,8 @@ class MpcConfig:
     qp_solver: str = "daqp"
 
     def __post_init__(self) -> None:
+        if self.n_clamps not in (1, 2):
+            raise ValueError(f"n_clamps: expected 1 or 2, got {self.n_clamps}")
         for name in ("horizon", "iterations", "max_failures"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
@@ -80,6 +84,21 @@ class MpcConfig:
                 " daqp, osqp and qpoases come with its wheels"
             )
 
+    @property
+    def action(self) -> ClampAction:
+        """What is decided of one step, in fractions of the largest."""
+        return ClampAction(1.0, 1.0, planar=self.planar, n_clamps=self.n_clamps)
+
+    @property
+    def n_decisions(self) -> int:
+        """m, the decisions of one step."""
+        return self.action.size
+
+    @property
+    def n_constraints(self) -> int:
+        """Rows of ``LinearConstraints``."""
+        return self.horizon * (3 * self.n_clamps + (1 if self.n_clamps == 2 else 0))
+
 
 class LinearConstraints(NamedTuple):
     """``lower <= matrix @ decisions <= upper`` on the flat plan (N m,)."""
@@ -93,9 +112,9 @@ class LinearConstraints(NamedTuple):
 class ShapeProblem:
     """One control step's optimal control problem.
 
-    The plan (N, 10) holds each step's decisions in [-1, 1]: fractions of the largest step along
-    each axis of an action box inside ``limits``. Rotation axes are the clamps' d1 and d2 at the
-    beginning of the plan.
+    The plan (N, m) holds each step's decisions in [-1, 1]: fractions of the largest step along
+    each axis of an action box inside ``limits``; m is 10, with one of k = 2 clamps free 5, in the
+    plane 6 or 3. Rotation axes are the clamps' d1 and d2 at the beginning of the plan.
 
     Attributes:
         centerline: (n_nodes, 3) present shape [m].
@@ -103,7 +122,7 @@ class ShapeProblem:
         goal: (n_nodes, 3) [m].
         node_weights: (n_nodes,), mean 1.
         disturbance: (n_nodes, 3) added to the model's prediction at every step [m].
-        previous: (10,) decisions of the last step that was made.
+        previous: (m,) decisions of the last step that was made.
         limits: of the safety gate.
         config: weights and horizon.
     """
@@ -119,8 +138,8 @@ class ShapeProblem:
 
     @property
     def directions(self) -> Array:
-        """(12, 10) displacement [m, rad] of each decision."""
-        return step_directions(self.boundary, self.limits)
+        """(6 k, m) displacement [m, rad] of each decision."""
+        return step_directions(self.boundary, self.limits, self.config.planar)
 
     @property
     def shape_weights(self) -> Array:
@@ -133,23 +152,28 @@ class ShapeProblem:
 
     @property
     def decision_hessian(self) -> Array:
-        """(N 10, N 10) Hessian of the terms in step size and change of step."""
-        N = self.config.horizon
-        size = np.repeat([self.config.translation_weight, self.config.rotation_weight], [3, 2])
-        differences = np.kron(np.eye(N) - np.eye(N, k=-1), np.eye(N_DECISIONS))
+        """(N m, N m) Hessian of the terms in step size and change of step."""
+        config, N, action = self.config, self.config.horizon, self.config.action
+        size = np.repeat(
+            [config.translation_weight, config.rotation_weight],
+            [len(action.translation_axes), action.n_rotations],
+        )
+        differences = np.kron(np.eye(N) - np.eye(N, k=-1), np.eye(action.size))
         return 2.0 * (
-            np.diag(np.tile(size, 2 * N)) + self.config.change_weight * differences.T @ differences
+            np.diag(np.tile(size, N * action.n_clamps))
+            + config.change_weight * differences.T @ differences
         )
 
     @property
     def decision_gradient(self) -> Array:
-        """(N 10,) gradient of the same terms at a zero plan."""
-        gradient = np.zeros(self.config.horizon * N_DECISIONS)
-        gradient[:N_DECISIONS] = -2.0 * self.config.change_weight * self.previous
+        """(N m,) gradient of the same terms at a zero plan."""
+        m = self.config.n_decisions
+        gradient = np.zeros(self.config.horizon * m)
+        gradient[:m] = -2.0 * self.config.change_weight * self.previous
         return gradient
 
     def cost(self, plan: Array, shapes: Array) -> float:
-        """Of ``plan`` (N, 10), which leads through ``shapes`` (N, n_nodes, 3) [m]."""
+        """Of ``plan`` (N, m), which leads through ``shapes`` (N, n_nodes, 3) [m]."""
         flat = plan.ravel()
         errors = (shapes - self.goal).reshape(len(plan), -1)
         decisions = 0.5 * flat @ self.decision_hessian @ flat + self.decision_gradient @ flat
@@ -157,16 +181,17 @@ class ShapeProblem:
         return float((self.shape_weights * errors**2).sum() + decisions + offset)
 
     def clamp_origins(self) -> Array:
-        """(2, 3) present origins of the clamps [m]."""
-        assert self.boundary.right is not None
-        return np.array([self.boundary.left[:3, 3], self.boundary.right[:3, 3]])
+        """(k, 3) present origins of the clamps [m]."""
+        return self.boundary.clamps[:, :3, 3]
 
     def origin_map(self) -> Array:
-        """(N, 2, 3, N 10) linear map from the flat plan to the clamps' motions by each step [m]."""
+        """(N, k, 3, N m) linear map from the flat plan to the clamps' motions by each step [m]."""
         N = self.config.horizon
-        translations = self.directions.reshape(2, 2, 3, N_DECISIONS)[:, 0]
+        directions = self.directions
+        k, m = len(directions) // 6, directions.shape[1]
+        translations = directions.reshape(k, 2, 3, m)[:, 0]
         steps = np.tril(np.ones((N, N)))
-        return np.einsum("kj,gam->kgajm", steps, translations).reshape(N, 2, 3, -1)
+        return np.einsum("nj,gam->ngajm", steps, translations).reshape(N, k, 3, -1)
 
     def gaps(self, plan: Array) -> Array:
         """(N, 3) from the left to the right clamp's origin after each step of ``plan`` [m]."""
@@ -178,11 +203,13 @@ class ShapeProblem:
 
         The linear constraints miss it where a plan turns a taut rod.
         """
+        if self.boundary.right is None:
+            return 0.0
         longest = max(self.limits.max_gripper_distance, self.boundary.distance)
         return float(np.maximum(np.linalg.norm(self.gaps(plan), axis=1) - longest, 0.0).sum())
 
     def constraints(self, plan: Array) -> LinearConstraints:
-        """Workspace, overstretch and gripper distance, linearised at ``plan`` (N, 10).
+        """Workspace, overstretch and gripper distance, linearised at ``plan`` (N, m).
 
         A limit that is broken at present is widened to what it is, so that a zero plan always
         satisfies every row. The distance rows are linear along the axis between the clamps.
@@ -193,6 +220,9 @@ class ShapeProblem:
         N = len(moves)
         box_lower = np.tile((np.minimum(lower, origins) - origins).ravel(), N)
         box_upper = np.tile((np.maximum(upper, origins) - origins).ravel(), N)
+        box = LinearConstraints(moves.reshape(len(box_lower), -1), box_lower, box_upper)
+        if self.boundary.right is None:
+            return box
         gap = origins[1] - origins[0]
         gap_moves = moves[:, 1] - moves[:, 0]
         gaps = self.gaps(plan)
@@ -201,31 +231,33 @@ class ShapeProblem:
         longest = max(limits.max_gripper_distance, float(np.linalg.norm(gap)))
         shortest = np.minimum(limits.min_gripper_distance, present)
         return LinearConstraints(
-            np.concatenate([moves.reshape(6 * N, -1), np.einsum("ka,kam->km", axes, gap_moves)]),
-            np.concatenate([box_lower, shortest - present]),
-            np.concatenate([box_upper, longest - present]),
+            np.concatenate([box.matrix, np.einsum("ka,kam->km", axes, gap_moves)]),
+            np.concatenate([box.lower, shortest - present]),
+            np.concatenate([box.upper, longest - present]),
         )
 
 
 class Plan(NamedTuple):
-    """A solution: decisions (N, 10), the linear model's shapes (N, n_nodes, 3) and their cost."""
+    """A solution: decisions (N, m), the linear model's shapes (N, n_nodes, 3) and their cost."""
 
     decisions: Array
     shapes: Array
     cost: float
 
 
-def step_directions(boundary: BoundaryPoses, limits: SafetyLimits) -> Array:
-    """(12, 10) displacement [m, rad], world axes, of a decision of 1 in each direction.
+def step_directions(boundary: BoundaryPoses, limits: SafetyLimits, planar: bool = False) -> Array:
+    """(6 k, m) displacement [m, rad], world axes, of a decision of 1 in each direction.
 
-    Per gripper dx, dy, dz and rotations about d1 and d2. The box of decisions in [-1, 1] touches
-    the limits' balls with its corners, so no decision breaks a step limit.
+    Per gripper those of ``ClampAction``: dx, dy, dz and rotations about d1 and d2; if ``planar``
+    dx, dz and the rotation about d1. The box of decisions in [-1, 1] touches the limits' balls with
+    its corners, so no decision breaks a step limit.
     """
-    assert boundary.right is not None
-    directions = np.zeros((12, N_DECISIONS))
-    for i, clamp in enumerate((boundary.left, boundary.right)):
-        translation = directions[6 * i : 6 * i + 3, 5 * i : 5 * i + 3]
-        translation[:] = np.eye(3) * limits.translation_step / np.sqrt(3.0)
-        rotation = directions[6 * i + 3 : 6 * i + 6, 5 * i + 3 : 5 * i + 5]
-        rotation[:] = clamp[:3, :2] * limits.rotation_step / np.sqrt(2.0)
-    return directions
+    clamps = boundary.clamps
+    axes, turns = (2.0, 1.0) if planar else (3.0, 2.0)
+    action = ClampAction(
+        limits.translation_step / sqrt(axes),
+        limits.rotation_step / sqrt(turns),
+        planar=planar,
+        n_clamps=len(clamps),
+    )
+    return action.to_twists(np.eye(action.size), clamps).reshape(action.size, -1).T

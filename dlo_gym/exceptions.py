@@ -25,7 +25,7 @@ class UnreachablePose(DloError):
 
 
 class RenderingUnavailable(DloError):
-    """No headless OpenGL context could be made on this machine."""
+    """No headless OpenGL context, or no display for a viewer, is to be had on this machine."""
 
 
 class RecordingError(DloError):

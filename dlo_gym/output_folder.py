@@ -7,6 +7,19 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 
+def check_resume(*, resume: bool, overwrite: bool) -> None:
+    """Refuse to go on with a former result and to replace it, both at once.
+
+    Raises:
+        ValueError: if both are asked for.
+    """
+    if resume and overwrite:
+        raise ValueError(
+            "resume, overwrite: expected one of them at most, got both; --resume goes on with the"
+            " former result, --overwrite replaces it"
+        )
+
+
 def check_output_folder(out: Path, made: Iterable[str], *, overwrite: bool) -> None:
     """Refuse an output folder that exists, unless it is a former result and may be replaced.
 
@@ -34,16 +47,6 @@ def check_output_folder(out: Path, made: Iterable[str], *, overwrite: bool) -> N
         )
     if not overwrite:
         raise FileExistsError(f"{out} exists; pass --overwrite to replace it")
-
-
-def check_resume(resume: bool, overwrite: bool) -> None:
-    """Refuse a command that is to go on with what it finds and to throw it away.
-
-    Raises:
-        ValueError: naming both options.
-    """
-    if resume and overwrite:
-        raise ValueError("resume, overwrite: expected at most one of them, got both")
 
 
 def replace_folder(finished: Path, out: Path) -> None:

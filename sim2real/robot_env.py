@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from control.safety import SafetyGate
 from dlo_gym.envs import tasks
-from dlo_gym.envs.shape_env import RESET_OPTIONS, ShapeControlEnv, check_goal, shape_observation
+from dlo_gym.envs.shape_env import ShapeControlEnv, check_goal, shape_observation
 from dlo_gym.exceptions import DeviceError, SafetyStop, TrackLost, UnreachablePose
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.overlay import draw_overlay
@@ -24,6 +24,7 @@ from sim2real.goals import SAMPLED, env_config, make_goal
 from sim2real.loop import TrackedCable, slowed
 from sim2real.steps import BLEND
 
+RESET_OPTIONS = ("start", "goal")
 APPROACH_SPEED = 0.3  # of the speed limits, on the way to a start pose
 ARRIVED = (5e-4, 5e-3)  # at the start pose [m], [rad]
 PATIENCE, PROGRESS = 8, 0.1  # periods that may bring the start no nearer, than so many steps

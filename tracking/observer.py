@@ -15,32 +15,44 @@ class TrackerObserver:
     """Knows the rod only from the cell's images and clamp poses.
 
     Args:
-        predictor: "network" (the shipped ``ShapePredictor``, as in the paper), or "rod", which
-            knows the cell's rod exactly, and what it touches.
+        predictor: "network" (the shipped ``ShapePredictor``, as in the paper), which knows rods
+            held at both ends, or "rod", which knows the cell's rod exactly, and what it touches;
+            when omitted the network, but the rod where the right end is free.
         triangulation: see ``TrackerConfig``.
         lost_after: time unseen until ``TrackLost`` [s].
     """
 
     def __init__(
         self,
-        predictor: Literal["network", "rod"] = "network",
+        predictor: Literal["network", "rod"] | None = None,
         triangulation: Literal["curve", "paper"] = "curve",
         lost_after: float = 3.0,
     ) -> None:
-        self._predictor = check_predictor(predictor)
+        self._predictor = predictor if predictor is None else check_predictor(predictor)
         self._config = TrackerConfig(triangulation=triangulation, lost_after=lost_after)
         self._tracker: MultiViewTracker | None = None
 
     def reset(self, cell: "SimulatedCell") -> ShapeEstimate:
-        """Learns the rod's looks from the first images and tracks it in them."""
+        """Learns the rod's looks from the first images and tracks it in them.
+
+        Raises:
+            ValueError: if the network is asked for and the right end is free.
+        """
+        free = cell.boundary.right is None
+        name = self._predictor or ("rod" if free else "network")
+        if free and name == "network":
+            raise ValueError(
+                "predictor: expected rod where the right end is free, got network, which knows rods"
+                " held at both ends"
+            )
         views = cell.views()
         centerline = None
-        if self._predictor == "rod" and cell.obstacles:
+        if name == "rod" and cell.obstacles:
             predictor = RodPredictor(cell.properties, cell.n_nodes, rod=cell.copy_of_rod())
             # Between the same clamps a rod may lie on either side of an obstacle.
             centerline = cell.rod_state.positions
         else:
-            predictor = make_predictor(self._predictor, cell.properties, cell.n_nodes)
+            predictor = make_predictor(name, cell.properties, cell.n_nodes)
         self._tracker = MultiViewTracker(
             predictor, [view.camera for view in views], config=self._config
         )

@@ -1,6 +1,7 @@
 """What an action means: numbers in [-1, 1] against motions of the clamps."""
 
 from dataclasses import dataclass
+from math import inf
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,6 +22,9 @@ class ClampAction:
         axial_rotation: whether the clamps also turn about the rod's own axis.
         planar: whether the clamps stay in the plane of world x and z.
         n_clamps: 2, or 1 where the right end is free.
+
+    Raises:
+        ValueError: naming the field.
     """
 
     max_translation_step: float
@@ -28,6 +32,15 @@ class ClampAction:
     axial_rotation: bool = False
     planar: bool = False
     n_clamps: int = 2
+
+    def __post_init__(self) -> None:
+        for name in ("max_translation_step", "max_rotation_step"):
+            if not 0.0 < getattr(self, name) < inf:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        if self.n_clamps not in (1, 2):
+            raise ValueError(f"n_clamps: expected 1 or 2, got {self.n_clamps}")
+        if self.planar and self.axial_rotation:
+            raise ValueError("axial_rotation: expected False with planar, got True")
 
     @property
     def translation_axes(self) -> list[int]:
@@ -89,7 +102,6 @@ class ClampAction:
         return boundary.clamps
 
 
-def clamp_numbers(clamp: Array | None) -> Array:
+def clamp_numbers(clamp: Array) -> Array:
     """(9,) position [m], d1 and d3 of a clamp pose, as observations carry it."""
-    assert clamp is not None
     return np.concatenate([clamp[:3, 3], clamp[:3, 0], clamp[:3, 2]])

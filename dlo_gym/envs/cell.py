@@ -143,6 +143,13 @@ class SimulatedCell:
         return tuple(self.scene.cameras)
 
     @property
+    def rod_color(self) -> tuple[int, int, int]:
+        """RGB of the rod, 0 to 255."""
+        color = self._appearance.rod_color
+        red, green, blue = self.scene.rod_color if color is None else color
+        return round(255 * red), round(255 * green), round(255 * blue)
+
+    @property
     def rod_state(self) -> RodState:
         """The true state of the rod."""
         if self._rod_state is None:

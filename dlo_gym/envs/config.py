@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -70,6 +71,8 @@ class ShapeEnvConfig:
         occluder_size: their full extents in x, y, z [m].
         renderer: ``"opengl"``, or ``"raster"``, which is faster on a CPU and needs no OpenGL.
         quality: of the rendering, ``"fast"`` or ``"high"``, the latter with OpenGL only.
+        render_file: an .rrd file that ``render_mode="human"`` writes, for the rerun viewer,
+            instead of opening it; no other mode heeds it.
 
     Raises:
         ValueError: naming the option, what was expected and what came.
@@ -118,6 +121,7 @@ class ShapeEnvConfig:
     occluder_size: tuple[float, float, float] = (0.12, 0.12, 0.12)
     renderer: Literal["opengl", "raster"] = "opengl"
     quality: Literal["fast", "high"] = "fast"
+    render_file: Path | None = None
 
     OBSTACLE_KINDS: ClassVar[tuple[str, ...]] = ("post", "box")
 
@@ -127,6 +131,8 @@ class ShapeEnvConfig:
                 raise ValueError(
                     f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}"
                 )
+        if self.render_file is not None:
+            object.__setattr__(self, "render_file", Path(self.render_file))
         if self.renderer == "raster" and self.quality == "high":
             raise ValueError('quality: expected "fast" with renderer "raster", got "high"')
         if self.observer != "privileged" and not _is_entry_point(self.observer):

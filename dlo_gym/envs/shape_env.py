@@ -13,6 +13,7 @@ from dlo_gym.envs import goals, tasks
 from dlo_gym.envs.actions import ClampAction
 from dlo_gym.envs.cell import Appearance, SimulatedCell, sample_occluder_paths
 from dlo_gym.envs.config import ShapeEnvConfig
+from dlo_gym.envs.episode_viewer import EpisodeViewer
 from dlo_gym.envs.observers import make_observer
 from dlo_gym.envs.obstacle_course import sample_course
 from dlo_gym.envs.obstacle_rows import ROW, obstacle_rows
@@ -131,13 +132,22 @@ class ShapeControlEnv(gym.Env):
     Every field of `ShapeEnvConfig`, e.g.
     `gym.make("dlo_gym/ShapeControl-v0", goal_distance=(0.06, 0.1), reward="sparse")`.
 
+    ## Rendering
+    `render_mode="rgb_array"`: `render()` returns the views side by side, the goal drawn in;
+    `"rgb_array_list"` (by `gym.make`): those since the last call. `"human"`: every step appears in
+    the rerun viewer (`pip install 'dlo-gym[view]'`): cable, goal, arms, cameras with their images;
+    with `render_file="episodes.rrd"` it goes to a file for the viewer, which needs no display.
+
     ## Version History
     * v0: first version.
     """
 
     CONFIG: ClassVar[type[ShapeEnvConfig]] = ShapeEnvConfig
     RESET_OPTIONS: ClassVar[tuple[str, ...]] = ("start", "goal", "obstacles")
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": 10,
+    }
 
     def __init__(self, render_mode: str | None = None, **options: Any) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -158,6 +168,7 @@ class ShapeControlEnv(gym.Env):
             friction=config.friction,
         )
         self._observer = make_observer(config.observer, config.observer_options)
+        self._viewer: EpisodeViewer | None = None
         self._estimate: ShapeEstimate | None = None
         self._goal: Array | None = None
         self._commands: deque[BoundaryDisplacement] = deque()
@@ -202,6 +213,10 @@ class ShapeControlEnv(gym.Env):
         info = self._info(BoundaryDisplacement.zero(self.config.n_clamps), "")
         if randomized is not None:
             info["randomization"] = randomized
+        if self.render_mode == "human":
+            self._viewer = self._viewer or EpisodeViewer(self.cell, self.config.render_file)
+            self._viewer.begin(self._goal)
+            self._viewer.show(self.estimate, self._progress(info), "")
         return self._observation(), info
 
     def step(
@@ -221,6 +236,8 @@ class ShapeControlEnv(gym.Env):
         reward = self.compute_reward(
             observation["achieved_goal"], observation["desired_goal"], info
         )
+        if self._viewer is not None:
+            self._viewer.show(self.estimate, self._progress(info), termination)
         return observation, float(reward), bool(termination), False, info
 
     def _begin(self, options: dict[str, Any]) -> None:
@@ -311,7 +328,12 @@ class ShapeControlEnv(gym.Env):
         return action.astype(np.float32)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """All views side by side, with goal and estimate drawn in, or None without render mode."""
+        """All views side by side, with goal and estimate drawn in.
+
+        None without render mode, and in mode ``"human"``, where every step shows itself.
+        """
+        if self.render_mode == "human":
+            return None
         if self.render_mode is None:
             gym.logger.warn(
                 "render() was called without a render mode; pass render_mode='rgb_array' to make"
@@ -334,6 +356,9 @@ class ShapeControlEnv(gym.Env):
         return np.hstack([image[:height] for image in images])
 
     def close(self) -> None:
+        if self._viewer is not None:
+            self._viewer.close()
+        self._viewer = None
         self._observer.close()
         self.cell.close()
 
@@ -391,6 +416,10 @@ class ShapeControlEnv(gym.Env):
         success = error <= self.config.success_threshold
         info = {"success": success, "is_success": success, "shape_error": error}
         return info | self._info_of_cell(displacement, termination)
+
+    def _progress(self, info: dict[str, Any]) -> dict[str, float]:
+        """What the viewer plots."""
+        return {"goal_distance_mm": 1e3 * info["shape_error"]}
 
     def _info_of_cell(self, displacement: BoundaryDisplacement, termination: str) -> dict[str, Any]:
         """What there is to know whatever the task."""

@@ -55,6 +55,10 @@ class ShapeControlVectorEnv(VectorEnv):
         if threads is not None and threads < 1:
             raise ValueError(f"threads: expected at least 1, or None, got {threads}")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
+        if render_mode == "human":
+            raise ValueError(
+                "render_mode: expected None or 'rgb_array' of many environments, got 'human'"
+            )
         self.envs = [ShapeControlEnv(render_mode, **options) for _ in range(num_envs)]
         first = self.envs[0]
         self.config = first.config

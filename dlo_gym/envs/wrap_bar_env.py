@@ -200,6 +200,9 @@ class WrapBarEnv(ShapeControlEnv):
         }
         return info | self._info_of_cell(displacement, termination)
 
+    def _progress(self, info: dict[str, Any]) -> dict[str, float]:
+        return {"turns": info["winding"] / tau}
+
 
 def _start(
     bar: tuple[float, float], rng: np.random.Generator, config: WrapBarConfig

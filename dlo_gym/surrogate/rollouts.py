@@ -178,7 +178,7 @@ def rollouts(
 
 def _open_dataset(out: Path, settings: RolloutSettings, resume: bool, overwrite: bool) -> Manifest:
     """The manifest to go on from, in a folder that exists."""
-    check_resume(resume, overwrite)
+    check_resume(resume=resume, overwrite=overwrite)
     if out.exists() and not out.is_dir():
         raise FileExistsError(f"{out} is a file; name a folder")
     if not out.exists() or not any(out.iterdir()):

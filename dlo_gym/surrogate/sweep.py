@@ -209,7 +209,7 @@ def score_markdown(cells: list[dict[str, Any]], names: list[str]) -> str:
 
 def _open_sweep(out: Path, description: dict[str, Any], *, resume: bool, overwrite: bool) -> None:
     """Leaves a folder whose parts, if any, belong to ``description``."""
-    check_resume(resume, overwrite)
+    check_resume(resume=resume, overwrite=overwrite)
     file = out / "sweep.json"
     if resume and file.exists():
         try:

@@ -272,18 +272,19 @@ def train_surrogate(
 
     Raises:
         FileExistsError: if OUT holds a training and neither resume nor overwrite was given.
+        FileNotFoundError: if there is nothing to resume.
         DatasetError: if the data are damaged or incomplete.
         WeightsError: if the checkpoint or the weights are damaged or of another version.
         ValueError: on options that conflict.
     """
-    console = Console()
-    check_resume(resume, overwrite)
-    if evaluate and (resume or overwrite):
-        raise ValueError("evaluate: expected without resume and overwrite, got both")
-    if weights is not None and not evaluate:
-        raise ValueError(f"weights: expected with evaluate only, got {weights} for a training")
+    check_resume(resume=resume, overwrite=overwrite)
     if threads < 1:
         raise ValueError(f"threads: expected at least 1, got {threads}")
+    if weights is not None and not evaluate:
+        raise ValueError("weights: training starts from none; pass --evaluate to score a file")
+    if evaluate and (resume or overwrite):
+        raise ValueError("evaluate: trains nothing; expected neither resume nor overwrite")
+    console = Console()
     rollouts, manifest = load_rollouts(data)
     if evaluate:
         predictor = ShapePredictor.load(weights)
@@ -294,10 +295,12 @@ def train_surrogate(
     checkpoint, metrics, file = (out / name for name in names)
     if any((out / name).exists() for name in names) and not (resume or overwrite):
         raise FileExistsError(f"{out} exists; pass --overwrite to start anew or --resume to go on")
-    out.mkdir(parents=True, exist_ok=True)
+    if resume and not checkpoint.exists():
+        raise FileNotFoundError(f"no checkpoint.pt in {out}; there is nothing to resume")
     torch.set_num_threads(threads)
     trainer = Trainer(rollouts, settings)
-    if resume and checkpoint.exists():
+    out.mkdir(parents=True, exist_ok=True)
+    if resume:
         trainer.load(checkpoint)
     else:
         for name in names:

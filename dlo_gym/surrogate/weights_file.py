@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict, dataclass
 from itertools import chain, islice
+from math import inf
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -40,12 +41,20 @@ class Scales:
         translation: of a clamp.
         turn: of a clamp's change of tangent [-].
         change: of the predicted change of a coordinate.
+
+    Raises:
+        ValueError: naming the field.
     """
 
     position: float = 0.2
     translation: float = 0.012
     turn: float = 0.04
     change: float = 0.012
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if not (isinstance(value, int | float) and 0.0 < value < inf):
+                raise ValueError(f"{name}: expected a positive number, got {value!r}")
 
     def times(self, length: float) -> "Scales":
         """For a rod of ``length`` [m]."""

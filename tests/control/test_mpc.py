@@ -103,20 +103,23 @@ def small_problem(
     return problem, predictor
 
 
-@pytest.mark.parametrize("model", ["network", "rod"])
+@pytest.mark.parametrize("model", ["network", "rod", "rod, one end free", "rod in the plane"])
 def test_rollout_derivatives_match_finite_differences(model):
     rng = np.random.default_rng(3)
-    boundary = held(tilt=(0.2, 0.1, 0.0))
-    if model == "rod":
+    planar = model == "rod in the plane"
+    boundary = held(tilt=(0.2, 0.0 if planar else 0.1, 0.0))
+    if model == "rod, one end free":
+        boundary = BoundaryPoses(boundary.left)
+    if model == "network":
+        problem, predictor = small_problem()
+        used, centerline = SurrogateModel(predictor), problem.centerline
+    else:
         used = RodModel(20)
         rod = CosseratRod(ROD, 20)
         centerline = rod.settle(boundary).positions + 1e-3 * rng.normal(size=(21, 3))
-    else:
-        problem, predictor = small_problem()
-        used, centerline = SurrogateModel(predictor), problem.centerline
     used.reset(boundary, ROD)
-    plan = rng.uniform(-1, 1, (3, 10))
-    directions = step_directions(boundary, LIMITS)
+    directions = step_directions(boundary, LIMITS, planar)
+    plan = rng.uniform(-1, 1, (3, directions.shape[1]))
     disturbance = 1e-3 * rng.normal(size=centerline.shape)
 
     def shapes(z):
@@ -377,11 +380,46 @@ def test_an_estimate_that_is_not_finite_holds_still():
     assert "not finite" in mpc.diagnostics.status
 
 
-def test_no_decision_breaks_a_step_limit():
-    boundary = held(tilt=(0.4, 0.2, 0.1))
-    for corner in np.random.default_rng(0).choice([-1.0, 1.0], (20, 10)):
-        command = BoundaryDisplacement.from_vector(step_directions(boundary, LIMITS) @ corner)
+@pytest.mark.parametrize(("planar", "m"), [(False, 5), (True, 3)])
+@pytest.mark.parametrize("n_clamps", [1, 2])
+def test_no_decision_breaks_a_step_limit_and_the_largest_touch_it(planar, m, n_clamps):
+    boundary = BoundaryPoses(*held(tilt=(0.4, 0.2, 0.1)).clamps[:n_clamps])
+    directions = step_directions(boundary, LIMITS, planar)
+    assert directions.shape == (6 * n_clamps, m * n_clamps)
+    for corner in np.random.default_rng(0).choice([-1.0, 1.0], (20, m * n_clamps)):
+        command = BoundaryDisplacement.from_vector(directions @ corner)
         assert SafetyGate(LIMITS).check(command, boundary).reasons == ()
+        sizes = np.linalg.norm(command.vector.reshape(-1, 2, 3), axis=2)
+        assert_allclose(sizes, [[LIMITS.translation_step, LIMITS.rotation_step]] * n_clamps)
+
+
+def test_another_number_of_clamps_is_refused():
+    one = BoundaryPoses(held().left)
+    goal = CosseratRod(ROD).settle(one).positions
+    with pytest.raises(ValueError, match=r"boundary: expected 2 clamps, .*n_clamps .* got 1"):
+        ShapeMPC(RodModel(), LIMITS).reset(goal, one, ROD)
+    settings = MpcConfig(n_clamps=1)
+    with pytest.raises(ValueError, match=r"boundary: expected 1 clamps, .*n_clamps .* got 2"):
+        ShapeMPC(RodModel(), LIMITS, settings).reset(goal, held(), ROD)
+    with pytest.raises(ValueError, match="model: the surrogate knows rods held at both ends"):
+        ShapeMPC(SurrogateModel(ShapePredictor.load()), LIMITS, settings).reset(goal, one, ROD)
+
+
+def test_one_gripper_stops_at_the_wall():
+    """The goal's clamp lies 50 mm behind it; tilted at the wall, the rod reaches further."""
+    limits = replace(LIMITS, workspace=((-0.4, -0.25, 0.56), (-0.17, 0.25, 0.75)))
+    rod, start = CosseratRod(ROD), BoundaryPoses(pose(ALONG_X, [-0.2, 0.0, 0.62]))
+    estimate = rod.settle(start).positions
+    goal = estimate + np.array([0.08, 0.03, 0.0])
+    mpc = ShapeMPC(RodModel(), limits, MpcConfig(n_clamps=1))
+    mpc.reset(goal, start, ROD)
+    for _ in range(20):
+        boundary = rod.state.boundary
+        rod.move(mpc.control(estimate_of(rod.state.positions), boundary, goal))
+        assert mpc.diagnostics.ok
+    assert_allclose(rod.state.boundary.left[0, 3], -0.17, atol=1e-5)
+    error = np.linalg.norm(rod.state.positions - goal, axis=1).mean()
+    assert 0.03 < error < 0.046
 
 
 def test_impossible_goals_are_refused():
@@ -395,7 +433,13 @@ def test_impossible_goals_are_refused():
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("horizon", 0), ("error_scale", 0.0), ("damping", -1.0), ("qp_solver", "nothing")],
+    [
+        ("n_clamps", 3),
+        ("horizon", 0),
+        ("error_scale", 0.0),
+        ("damping", -1.0),
+        ("qp_solver", "nothing"),
+    ],
 )
 def test_senseless_settings_are_refused(field, value):
     with pytest.raises(ValueError, match=field):

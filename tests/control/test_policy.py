@@ -1,9 +1,11 @@
+import json
 import subprocess
 import sys
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from control.policy import (
@@ -17,9 +19,10 @@ from control.policy import (
 from dlo_gym.envs.actions import ClampAction
 from dlo_gym.exceptions import WeightsError
 from dlo_gym.geometry.se3 import pose
-from dlo_gym.rod import BoundaryPoses, ShapeEstimate
+from dlo_gym.rod import BoundaryPoses, RodProperties, ShapeEstimate
 
 ACTION = ClampAction(0.01, 0.08)
+ROD = RodProperties(length=0.5)
 N_INPUTS = 6 * N_POINTS + N_CLAMPS
 ALONG_X = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 APART = BoundaryPoses(pose(ALONG_X, [-0.2, 0.0, 0.34]), pose(ALONG_X, [0.2, 0.0, 0.34]))
@@ -97,6 +100,65 @@ def test_layers_that_do_not_fit_or_are_not_finite_are_refused(policy, tmp_path):
     policy.save(path)
     with pytest.raises(WeightsError, match="finite layers"):
         Policy.load(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda tensors, metadata: metadata.update(format="dlo-gym policy 7"),
+            "got 'dlo-gym policy 7",
+        ),
+        (lambda tensors, metadata: metadata.pop("action"), "incomplete: KeyError"),
+        (lambda tensors, metadata: tensors.pop("bias_0"), "incomplete: KeyError"),
+        (
+            lambda tensors, metadata: tensors.update(bias_1=np.zeros(())),
+            "matrices and their biases",
+        ),
+        (
+            lambda tensors, metadata: tensors.update(weight_1=np.zeros(8)),
+            "matrices and their biases",
+        ),
+        (lambda _, metadata: set_action(metadata, wobble=0.1), "wobble"),
+        (lambda _, metadata: set_action(metadata, n_clamps=3), "n_clamps: expected 1 or 2, got 3"),
+        (lambda _, metadata: set_action(metadata, max_rotation_step=-1), "max_rotation_step"),
+        (lambda _, metadata: set_action(metadata, n_clamps=1), "to 5 actions"),
+    ],
+)
+def test_a_policy_of_another_version_is_named_with_what_differs(policy, tmp_path, change, message):
+    path = tmp_path / "policy.safetensors"
+    policy.save(path)
+    with safe_open(path, "numpy") as file:
+        metadata = file.metadata()
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    change(tensors, metadata)
+    save_file(tensors, path, metadata)
+    with pytest.raises(WeightsError, match=message) as raised:
+        Policy.load(path)
+    assert str(path) in str(raised.value)
+
+
+def set_action(metadata, **changes):
+    metadata["action"] = json.dumps(json.loads(metadata["action"]) | changes)
+
+
+def test_a_policy_for_one_clamp_reads_nothing_of_the_other_and_refuses_two():
+    action = ClampAction(0.01, 0.08, n_clamps=1)
+    rng = np.random.default_rng(0)
+    policy = Policy([rng.normal(size=(5, N_INPUTS))], [np.zeros(5)], action)
+    controller = PolicyController(policy)
+    alone = BoundaryPoses(APART.left)
+    controller.reset(line(), alone, ROD)
+    command = controller.control(estimate(line()), alone, line())
+    assert command.right is None
+    read = np.zeros(N_CLAMPS)
+    read[:9] = np.concatenate([APART.left[:3, 3], APART.left[:3, 0], APART.left[:3, 2]])
+    inputs = np.concatenate([sample_points(line()), sample_points(line()), read])
+    np.testing.assert_allclose(
+        action.to_action(command, alone), np.tanh(policy.weights[0] @ inputs), atol=1e-12
+    )
+    with pytest.raises(ValueError, match="policy: expected one for the 2 clamps .* moves 1"):
+        controller.reset(line(), APART, ROD)
 
 
 def test_the_controller_stays_within_the_step_limits(policy):

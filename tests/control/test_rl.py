@@ -1,4 +1,5 @@
 import json
+import pickle
 import shutil
 import signal
 import subprocess
@@ -137,7 +138,8 @@ def test_a_run_leaves_policy_scores_and_checkpoint(trained):
 def test_a_worse_policy_does_not_replace_the_best(trained, tmp_path):
     shutil.copytree(trained, tmp_path / "run")
     (newest,) = (tmp_path / "run").glob("checkpoint-*")
-    (newest / "progress.json").write_text('{"best_error": 0.0}')
+    progress = json.loads((newest / "progress.json").read_text())
+    (newest / "progress.json").write_text(json.dumps(progress | {"best_error": 0.0}))
     best = (trained / "policy.safetensors").read_bytes()
     rl.train_rl(tmp_path / "run", **SMALL | {"steps": 145}, resume=True)
     assert len((tmp_path / "run" / "evaluations.jsonl").read_text().splitlines()) == 3
@@ -228,6 +230,53 @@ def test_a_damaged_replay_buffer_is_named(trained, tmp_path, env):
     (tmp_path / newest.name / "replay_buffer.pkl").write_bytes(b"not a pickle")
     with pytest.raises(DloError, match=f"{newest.name} is damaged"):
         load_checkpoint(tmp_path, env, seed=0)
+
+
+class GoneSince:
+    """What a replay buffer of another version may hold."""
+
+
+def test_a_checkpoint_of_another_version_is_named(trained, tmp_path, env, monkeypatch):
+    (newest,) = trained.glob("checkpoint-*")
+    folder = shutil.copytree(newest, tmp_path / newest.name)
+    progress = json.loads((folder / "progress.json").read_text())
+    for changed, message in (
+        (progress | {"format": "dlo-gym checkpoint 9"}, "checkpoint 1', got 'dlo-gym checkpoint 9"),
+        ({"best_error": 0.1}, "checkpoint 1', got None"),
+        ([], "is damaged"),
+    ):
+        (folder / "progress.json").write_text(json.dumps(changed))
+        with pytest.raises(DloError, match=f"{newest.name}.*{message}"):
+            load_checkpoint(tmp_path, env, seed=0)
+    (folder / "progress.json").write_text(json.dumps(progress))
+    (folder / "replay_buffer.pkl").write_bytes(pickle.dumps(GoneSince()))
+    monkeypatch.delattr(sys.modules[__name__], "GoneSince")
+    with pytest.raises(DloError, match=f"{newest.name}.*another version.*GoneSince"):
+        load_checkpoint(tmp_path, env, seed=0)
+
+
+def test_a_checkpoint_for_other_grippers_is_named(trained, env):
+    other = PolicyObservation(gym.make("dlo_gym/ShapeControlOneArm-v0"))
+    with pytest.raises(DloError, match=r"checkpoint-.*Action spaces do not match.*\(10,\).*\(5,\)"):
+        load_checkpoint(trained, other, seed=0)
+
+
+def test_settings_of_another_version_are_named(trained, tmp_path):
+    shutil.copytree(trained, tmp_path / "run")
+    file = tmp_path / "run" / "config.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"entropy": 0.1}))
+    with pytest.raises(DloError, match="config.json is of another version: .*entropy"):
+        rl.train_rl(tmp_path / "run", **SMALL, resume=True)
+    file.write_text("{")
+    with pytest.raises(DloError, match="config.json is damaged"):
+        rl.train_rl(tmp_path / "run", **SMALL, resume=True)
+
+
+def test_resume_and_overwrite_at_once_delete_nothing(trained):
+    before = sorted(path.name for path in trained.iterdir())
+    with pytest.raises(ValueError, match="resume, overwrite: expected one of them"):
+        rl.train_rl(trained, **SMALL, resume=True, overwrite=True)
+    assert sorted(path.name for path in trained.iterdir()) == before
 
 
 @pytest.mark.parametrize("step", [5, 90])  # before and after the first evaluation

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from dlo_gym.output_folder import check_output_folder, replace_folder
+from dlo_gym.output_folder import check_output_folder, check_resume, replace_folder
 
 MADE = ("metrics.json", "checkpoint-*")
 
@@ -60,3 +60,10 @@ def test_a_replacement_that_fails_gives_the_old_one_back(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         replace_folder(part, out)
     assert (out / "metrics.json").read_text() == "old"
+
+
+def test_going_on_and_replacing_exclude_each_other():
+    for resume, overwrite in ((False, False), (True, False), (False, True)):
+        check_resume(resume=resume, overwrite=overwrite)
+    with pytest.raises(ValueError, match="resume, overwrite: expected one of them at most"):
+        check_resume(resume=True, overwrite=True)

@@ -3,7 +3,6 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import dlo_gym
 from dlo_gym.envs import goals, tasks
@@ -29,23 +28,23 @@ def opengl():
 
 
 @pytest.mark.parametrize("task", TASKS[1:])
-def test_both_checkers_find_nothing(task, opengl):
+def test_both_checkers_find_nothing(task, opengl, gym_check):
+    gym_check(f"dlo_gym/ShapeControl{task}-v0", image_scale=0.1)
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(make(task, image_scale=0.1).unwrapped)
         checker.check_env(make(task).unwrapped)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("observed", ["Tracked", "Images"])
-def test_both_checkers_find_nothing_in_what_sees_images(task, observed, opengl):
+def test_both_checkers_find_nothing_in_what_sees_images(task, observed, opengl, gym_check):
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     options = {"image_scale": 0.1} if observed == "Images" else {}
+    gym_check(f"dlo_gym/ShapeControl{task}{observed}-v0", **options)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(make(task + observed, **options).unwrapped)
         checker.check_env(make(task + observed, **options).unwrapped)
 
 
@@ -124,6 +123,21 @@ def test_one_arm_holds_a_rod_whose_other_end_hangs_free():
     np.testing.assert_allclose(info["displacement"], np.eye(12)[0] * 0.01, atol=1e-12)
 
 
+def test_one_arm_is_tracked_with_the_rod_as_predictor(opengl):
+    env = make("OneArmTracked", image_scale=1 / 3)
+    env.reset(seed=7)
+    errors = []
+    for _ in range(12):
+        *_, info = env.step(np.array([0.5, 0.5, 1.0, 0.5, -0.5], np.float32))
+        errors.append(info["tracking_ptp3d"])
+    assert max(errors) < 2e-3
+    env.close()
+    network = make("OneArmTracked", observer_options={"predictor": "network"})
+    with pytest.raises(ValueError, match="predictor: expected rod .* free, got network"):
+        network.reset(seed=7)
+    network.close()
+
+
 def test_one_arm_takes_one_clamp_and_a_free_goal():
     env = make("OneArm").unwrapped
     env.reset(seed=1)
@@ -162,13 +176,3 @@ def test_a_vector_of_them_is_each_of_them(task):
 def test_options_that_contradict_each_other_are_refused(options, said):
     with pytest.raises(ValueError, match=said):
         make("", **options)
-
-
-def test_the_images_of_an_episode_come_as_a_list(opengl):
-    env = make("Planar", render_mode="rgb_array_list", image_scale=0.1)
-    env.reset(seed=0)
-    env.step(np.zeros(6))
-    images = env.render()
-    assert len(images) == 2
-    assert images[0].shape == images[1].shape == (108, 384, 3)
-    env.close()

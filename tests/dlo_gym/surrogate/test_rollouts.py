@@ -59,6 +59,11 @@ class TestDataset:
         with pytest.raises(FileExistsError, match="--overwrite"):
             rollouts(finished, TINY, workers=1)
 
+    def test_going_on_and_overwriting_at_once_deletes_nothing(self, finished):
+        with pytest.raises(ValueError, match="resume, overwrite"):
+            rollouts(finished, TINY, workers=1, resume=True, overwrite=True)
+        assert len(load_rollouts(finished)[0].lengths) == TINY.n_rollouts
+
     def test_overwrite_makes_it_anew(self, tmp_path):
         rollouts(tmp_path / "data", TINY, workers=1)
         other = dataclasses.replace(TINY, n_rollouts=2)

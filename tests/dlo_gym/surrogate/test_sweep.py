@@ -91,6 +91,8 @@ def test_a_sweep_that_exists_is_spared(finished, tmp_path):
         evaluate_surrogate(finished, TINY, workers=1)
     with pytest.raises(ValueError, match="other settings or weights"):
         evaluate_surrogate(finished, dataclasses.replace(TINY, seed=1), workers=1, resume=True)
+    with pytest.raises(ValueError, match="resume, overwrite"):
+        evaluate_surrogate(finished, TINY, workers=1, resume=True, overwrite=True)
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(FileExistsError, match=r"thesis\.tex"):
         evaluate_surrogate(tmp_path, TINY, workers=1, overwrite=True)

@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -285,6 +286,41 @@ class TestTraining:
         (tmp_path / "checkpoint.pt").write_bytes(b"no such thing")
         with pytest.raises(WeightsError, match=r"checkpoint.pt: damaged"):
             trainer.load(tmp_path / "checkpoint.pt")
+
+    def test_a_checkpoint_of_another_version_or_network_is_named(self, small_rollouts, tmp_path):
+        trainer, file = Trainer(small_rollouts, SHORT), tmp_path / "checkpoint.pt"
+        torch.save({"settings": dataclasses.asdict(SHORT), "epoch": 3}, file)
+        with pytest.raises(WeightsError, match=r"checkpoint.pt: .*another version: .*'epoch'"):
+            trainer.load(file)
+        trainer.save(file)
+        content = torch.load(file, weights_only=True)
+        content["network"].popitem()
+        torch.save(content, file)
+        with pytest.raises(
+            WeightsError, match=r"(?s)checkpoint.pt: .*another network: .*Missing key"
+        ):
+            trainer.load(file)
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"resume": True, "overwrite": True}, "resume, overwrite: expected one of them"),
+            ({"weights": Path("w.safetensors")}, "weights: .*--evaluate"),
+            ({"evaluate": True, "resume": True}, "evaluate: "),
+            ({"threads": 0}, "threads: expected at least 1, got 0"),
+        ],
+    )
+    def test_options_that_do_not_go_together_are_refused(self, data, tmp_path, options, message):
+        with pytest.raises(ValueError, match=message):
+            train_surrogate(data, SHORT, out=tmp_path / "out", **options)
+        assert not (tmp_path / "out").exists()
+
+    def test_resume_needs_a_checkpoint_and_deletes_nothing(self, data, tmp_path):
+        kept = tmp_path / "shape_predictor.safetensors"
+        kept.write_bytes(b"trained for a week")
+        with pytest.raises(FileNotFoundError, match="nothing to resume"):
+            train_surrogate(data, SHORT, out=tmp_path, resume=True)
+        assert [file.name for file in tmp_path.iterdir()] == [kept.name]
 
     def test_settings_name_what_is_wrong(self):
         for change, name in (({"steps": 0}, "steps"), ({"learning_rate": 0.0}, "learning_rate")):

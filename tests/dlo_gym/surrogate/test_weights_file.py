@@ -139,6 +139,10 @@ def unknown_scale(tensors, metadata):
     metadata["scales"] = json.dumps({"position": 1.0, "smell": 2.0})
 
 
+def negative_scale(tensors, metadata):
+    metadata["scales"] = json.dumps({"position": -1.0})
+
+
 def drop_tensor(tensors, metadata):
     del tensors["prediction.2.bias"]
 
@@ -165,6 +169,7 @@ def wrong_type(tensors, metadata):
         (set_schema, r"expected schema dlo-shape-predictor/2.*got dlo-shape-predictor/9"),
         (drop_scales, "scales"),
         (unknown_scale, "smell"),
+        (negative_scale, "position: expected a positive number, got -1.0"),
         (drop_tensor, r"prediction.2.bias: expected shape \(8,\), got none"),
         (drop_first, r"state.0.weight"),
         (wrong_shape, r"action.1.weight: expected shape \(4, 4\), got \(3, 3\)"),
