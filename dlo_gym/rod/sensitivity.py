@@ -166,19 +166,21 @@ def with_displacement(sensitivity: MotionSensitivity, n_clamps: int) -> MotionSe
 
 def carried_of(
     sensitivity: MotionSensitivity,
+    moving: int,
+    duration: float,
     rotations: Array,
     internal_damping: float,
     weight: Array,
-    velocity: Array,
 ) -> Carried:
     """What the kernels carry from ``sensitivity``.
 
     Args:
         sensitivity: of the rod's present state.
+        moving: how many of its last columns are of the clamps' displacement.
+        duration: in which they are displaced [s].
         rotations: (2, 3, 3) R_world_clamp.
         internal_damping: of the rod [s].
         weight: (n + 1, 3) of the nodes [N].
-        velocity: (12, m) of the clamps in world axes, by every column [m/s, rad/s].
     """
     names, n = sensitivity.columns, len(sensitivity.turns)
     codes = np.array(
@@ -190,7 +192,8 @@ def carried_of(
     poses = sensitivity.clamps.reshape(2, 2, 3, -1)
     carried.positions[:] = poses[:, 0]
     carried.turns[:] = rotations.transpose(0, 2, 1) @ poses[:, 1]
-    carried.velocity[:] = velocity
+    for k in range(moving):
+        carried.velocity[k, len(names) - moving + k] = 1.0 / duration
     unknowns = carried.now.unknowns
     unknowns[:-3].reshape(n, 6, -1)[:, :3] = sensitivity.positions[:-1]
     unknowns[-3:] = sensitivity.positions[-1]
