@@ -5,13 +5,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from dlo_gym.exceptions import DloError
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.properties import RodProperties
 from sim2real.identification.cable_motion import CableMotion
-from sim2real.identification.parameters import Parameter, prior, properties_of
+from sim2real.identification.parameters import AT_REST, Parameter, prior, properties_of
 from sim2real.identification.residuals import Residuals
 
 LEARNT = 0.5  # posterior over prior deviation above which a motion told nothing of a parameter
@@ -74,7 +75,7 @@ def identify(
     motions: Sequence[CableMotion],
     *,
     dynamic: bool = False,
-    start: Sequence[float] | None = None,
+    start: ArrayLike | None = None,
     callback: Callable[[float], None] | None = None,
 ) -> Identified:
     """The parameters of which a rod moves most like the cable did in all ``motions``.
@@ -85,7 +86,8 @@ def identify(
     Args:
         motions: of one cable.
         dynamic: whether the rod has inertia; at rest in every sample otherwise.
-        start: values to start from; the priors' medians if None.
+        start: values to start from; if None the priors' medians, or for a rod with inertia what
+            is found at rest.
         callback: called with the RMS [m] of every trial.
 
     Raises:
@@ -97,8 +99,11 @@ def identify(
     parameters = prior(motions[0].length)[: 8 if dynamic else 6]
     z = np.zeros(len(parameters))
     if start is not None:
-        z = np.array([p.z(value) for p, value in zip(parameters, start, strict=True)])
-    residuals = Residuals(motions, parameters, callback)
+        values = np.asarray(start, dtype=np.float64)
+        z = np.array([p.z(value) for p, value in zip(parameters, values, strict=True)])
+    elif dynamic:
+        z[: len(AT_REST)] = identify(motions, callback=callback).z
+    residuals = Residuals(motions, parameters, dynamic, callback)
     if not np.isfinite(residuals.rms(z)):
         raise IdentificationFailed("no rod of plausible parameters could follow the motion")
     scale = FIRST_SCALE
