@@ -50,6 +50,7 @@ from dlo_gym.rod._kernels_rates import (
     kinetic_energy,
     strain_rates,
 )
+from dlo_gym.rod._kernels_sensitivity import begin, carry, share_gain
 from dlo_gym.rod._kernels_solve import (
     CONVERGED,
     STALLED,
@@ -58,10 +59,8 @@ from dlo_gym.rod._kernels_solve import (
     follow,
     free_range,
 )
+from dlo_gym.rod._kernels_stage import BDF_NEW, BDF_OLD, GAMMA, set_stage
 
-GAMMA = 2.0 - sqrt(2.0)
-BDF_NEW = 1.0 / (GAMMA * (2.0 - GAMMA))
-BDF_OLD = (1.0 - GAMMA) ** 2 * BDF_NEW
 ERROR = 2.0 * abs(-3.0 * GAMMA**2 + 4.0 * GAMMA - 2.0) / (12.0 * (2.0 - GAMMA))
 
 SMALLEST_STEP = 1.0 / 1024.0  # of the step that was asked for
@@ -83,34 +82,6 @@ class Plan(NamedTuple):
     steps: int
     order: int
     tolerance: float
-
-
-@njit(cache=True)
-def set_stage(rod, motion, s, base, ends, stage):
-    """Update ``stage`` to springs and viscous stiffness; ``base`` holds b and c."""
-    n = base.q.shape[0]
-    damping = motion.external * s
-    for i in range(3 * n + 1):
-        stage.inertia.weight[i] = motion.mass[i] * (1.0 + damping) / s**2
-    stage.inertia.weight[0] = 0.0  # the clamps carry the nodes they hold
-    if ends.right_held:
-        stage.inertia.weight[n] = 0.0
-    # Where the damped, unloaded motion ends.
-    combine(1.0, base.places, s / (1.0 + damping), base.speeds, stage.inertia.centre)
-    if not inelastic(motion):
-        return
-    share = motion.internal / s
-    combine(1.0 + share, rod.shear, 0.0, rod.shear, stage.rod.shear)
-    shift = share / (1.0 + share)
-    combine(1.0 - shift, rod.rest_strain, shift, base.strain, stage.rod.rest_strain)
-    combine(share, rod.bending, 0.0, rod.bending, stage.rod.viscous)
-    combine(1.0, base.strain[n:], 0.0, base.strain[n:], stage.rod.viscous_centre)
-    # M = B (k - c k_v) for k = kappa - kappa0 - plastic, k_v = (b_v + a k) / (1 + a).
-    a = s / motion.relaxation
-    softer = 1.0 - motion.creep * a / (1.0 + a)
-    crept = motion.creep / ((1.0 + a) * softer)
-    combine(softer, rod.bending, 0.0, rod.bending, stage.rod.bending)
-    combine(1.0, motion.rest_curvature, crept, base.creep, stage.rod.rest_curvature)
 
 
 @njit(cache=True)
@@ -267,12 +238,13 @@ def _step(system, motion, path, plan, time, h, ends, now, scratch, limits, work)
 
 
 @njit(cache=True)
-def advance(system, motion, path, ends, x, q, v, w, creep, plan, limits, work):
+def advance(system, motion, path, ends, x, q, v, w, creep, plan, limits, work, carried=None):
     """Update x, q, v, w, creep along ``path``; returns (status, time reached [s], energy [J]).
 
     Steps are shortened where Newton's method fails, where the error estimate exceeds the
     tolerance, or where energy appears from nowhere; what little is left of such a gain is taken
     from the velocities, so that between clamps that hold still the total energy never grows.
+    ``carried`` (``_kernels_sensitivity.Carried``) goes along, where it is given.
     """
     n = q.shape[0]
     now, scratch = empty_moment(n), empty_scratch(system, n)
@@ -287,6 +259,8 @@ def advance(system, motion, path, ends, x, q, v, w, creep, plan, limits, work):
         strains(system.rod, now.places, now.q, ends, now.strain[:n], now.strain[n:])
         flow_plastically(system.rod, now.strain[n:], now.plastic)
         set_material(system, motion, now)
+    if carried is not None:
+        begin(system, path, ends, now, carried)
     still = True
     for k in range(12):
         still = still and path.velocity[k] == 0.0
@@ -332,7 +306,23 @@ def advance(system, motion, path, ends, x, q, v, w, creep, plan, limits, work):
                 status = STALLED
                 break
             continue
+        if carried is not None:
+            carry(
+                system,
+                motion,
+                path,
+                plan.order,
+                time,
+                h,
+                ends.right_held,
+                now,
+                scratch,
+                carried,
+                work,
+            )
         if still and gain > 0.0:
+            if carried is not None:
+                share_gain(system, motion, gain, new_kinetic, ends, now, before, carried, work)
             scale = sqrt(max(0.0, 1.0 - gain / new_kinetic)) if new_kinetic > 0.0 else 0.0
             combine(scale, now.speeds, 0.0, now.speeds, now.speeds)
             combine(scale, now.w, 0.0, now.w, now.w)

@@ -32,7 +32,7 @@ def rod_arrays(properties: RodProperties, n: int, gravity: Array, clamp: str) ->
         np.ascontiguousarray(shear),
         np.zeros((n, 3)),
         bending,
-        np.concatenate([rest[:1], rest, rest[-1:]]),
+        np.ascontiguousarray(np.concatenate([rest[:1], rest, rest[-1:]])),
         voronoi,
         node_weights(properties, n, gravity),
         np.zeros((n + 1, 2)),

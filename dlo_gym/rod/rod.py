@@ -18,6 +18,7 @@ from dlo_gym.rod._kernels_clamps import clamp_frame
 from dlo_gym.rod._kernels_inertia import NO_INERTIA, Inertia
 from dlo_gym.rod._kernels_moment import hidden_energy
 from dlo_gym.rod._kernels_rates import kinetic_energy
+from dlo_gym.rod._kernels_sensitivity import Carried
 from dlo_gym.rod.arrays import node_weights, rod_arrays
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.contact import ContactModel, check_clamps
@@ -25,7 +26,16 @@ from dlo_gym.rod.dynamics import clamp_path, motion_of, plan_of
 from dlo_gym.rod.initial_shapes import hanging
 from dlo_gym.rod.obstacles import Obstacle, check_obstacles, on_the_way
 from dlo_gym.rod.properties import RodProperties, per_element
-from dlo_gym.rod.sensitivity import parameter_sensitivity
+from dlo_gym.rod.sensitivity import (
+    MOTION_PARAMETERS,
+    MotionSensitivity,
+    at_rest,
+    carried_of,
+    check_parameters,
+    parameter_sensitivity,
+    sensitivity_of,
+    with_displacement,
+)
 from dlo_gym.rod.state import RodMemory, RodState
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -294,6 +304,99 @@ class CosseratRod:
                 further apart than the rod is long or inside an obstacle.
             RodDiverged: if no step was small enough; the rod keeps its state before.
         """
+        return self._advance(displacement, duration, dt, order, tolerance, obstacles)
+
+    def advance_with_sensitivity(
+        self,
+        sensitivity: MotionSensitivity,
+        displacement: BoundaryDisplacement,
+        duration: float,
+        *,
+        dt: float = 0.025,
+        order: Literal[1, 2] = 2,
+        tolerance: float | None = None,
+        by_displacement: bool = False,
+    ) -> tuple[RodState, MotionSensitivity]:
+        """``advance``, and what becomes of the present state's ``sensitivity`` meanwhile.
+
+        It is exact for the steps as they are taken: their number and lengths count as given.
+
+        Args:
+            sensitivity: from ``motion_sensitivity`` or from the advance before.
+            displacement, duration, dt, order, tolerance: as for ``advance``.
+            by_displacement: whether to append columns for this ``displacement``, named
+                ``sensitivity.DISPLACEMENT``.
+
+        Raises:
+            ValueError: as ``advance``; or if the rod yields, creeps or can touch something, or the
+                sensitivity is of another number of elements.
+            RodDiverged: as ``advance``.
+        """
+        self._settled("advance_with_sensitivity")
+        self._check_smooth("advance_with_sensitivity")
+        if len(sensitivity.turns) != self.n_elements:
+            raise ValueError(
+                f"sensitivity: expected that of {self.n_elements} elements,"
+                f" got {len(sensitivity.turns)}"
+            )
+        by_before = len(sensitivity.columns)
+        if by_displacement:
+            sensitivity = with_displacement(sensitivity, 1 + self._ends.right_held)
+        velocity = np.zeros((12, len(sensitivity.columns)))
+        extra = velocity[:, by_before:]
+        np.fill_diagonal(extra, 1.0 / duration)
+        carried = carried_of(
+            sensitivity, self._rotations, self.properties.internal_damping,
+            node_weights(self.properties, self.n_elements, self.gravity), velocity,
+        )  # fmt: skip
+        state = self._advance(displacement, duration, dt, order, tolerance, None, carried)
+        after = sensitivity_of(sensitivity.columns, carried, self._rotations, duration)
+        return state, after
+
+    def motion_sensitivity(
+        self, parameters: Sequence[str] = MOTION_PARAMETERS, *, equilibrium: bool = True
+    ) -> MotionSensitivity:
+        """The present state's derivatives by ``parameters``, for ``advance_with_sensitivity``.
+
+        Args:
+            parameters: of ``sensitivity.MOTION_PARAMETERS``.
+            equilibrium: whether the rod is at rest, in a state that depends on the parameters; if
+                not, the state is one given, whatever the parameters.
+
+        Raises:
+            ValueError: naming the argument; or if the rod has not settled, yields, creeps, can
+                touch something, or is in motion though it is to be at rest.
+        """
+        self._settled("motion_sensitivity")
+        self._check_smooth("motion_sensitivity")
+        names = check_parameters(parameters)
+        if not equilibrium:
+            return MotionSensitivity.zero(names, self.n_elements)
+        if self._v.any() or self._w.any():
+            raise ValueError("equilibrium: expected False for a rod in motion, got True")
+        return at_rest(names, self._by_parameters())
+
+    def _check_smooth(self, action: str) -> None:
+        if self._contact.possible or self._motion.yields or self._motion.creep > 0.0:
+            raise ValueError(
+                f"{action}: expected a rod that neither yields nor creeps and can touch nothing"
+            )
+
+    def _by_parameters(self) -> Array:
+        """(n_dofs, 7) of the unknowns by PARAMETERS, at an equilibrium."""
+        weight = node_weights(self.properties, self.n_elements, self.gravity)
+        return parameter_sensitivity(self._arrays, weight, self._x, self._q, self._ends, self._work)
+
+    def _advance(
+        self,
+        displacement: BoundaryDisplacement,
+        duration: float,
+        dt: float,
+        order: Literal[1, 2] | None,
+        tolerance: float | None,
+        obstacles: Sequence[Obstacle] | None,
+        carried: Carried | None = None,
+    ) -> RodState:
         before = self._settled("advance")
         touching = self._contact.possible
         if touching and (order == 2 or tolerance is not None):
@@ -316,6 +419,7 @@ class CosseratRod:
             status, reached, self._energy = dynamics_kernels.advance(
                 self._system, self._motion, path, self._ends,
                 self._x, self._q, self._v, self._w, self._creep, plan, self._limits, self._work,
+                carried,
             )  # fmt: skip
         problem = "" if status == kernels.CONVERGED else "no time step was small enough"
         problem = problem or self._implausible()
@@ -408,10 +512,7 @@ class CosseratRod:
         self._settled("parameter_sensitivity")
         if self._contact.possible:
             raise ValueError("parameter_sensitivity: expected a rod that can touch nothing")
-        weight = node_weights(self.properties, self.n_elements, self.gravity)
-        return self._of_nodes(
-            parameter_sensitivity(self._system, weight, self._x, self._q, self._ends, self._work)
-        )
+        return self._of_nodes(self._by_parameters())
 
     def _of_nodes(self, columns: Array) -> Array:
         """The rows of (n_dofs, m) that are positions, as (n_nodes, 3, m)."""

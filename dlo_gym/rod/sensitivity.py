@@ -1,12 +1,17 @@
-"""Derivatives of an equilibrium by the rod's parameters."""
+"""Derivatives of a rod by its parameters: at an equilibrium, and carried along a motion."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from dlo_gym.geometry.se3 import Array
-from dlo_gym.rod._kernels_assembly import System, assemble
 from dlo_gym.rod._kernels_banded import solve
 from dlo_gym.rod._kernels_energy import Ends, RodArrays, Work
+from dlo_gym.rod._kernels_parameters import explicit_gradient
+from dlo_gym.rod._kernels_sensitivity import Carried, empty_carried
 from dlo_gym.rod._kernels_solve import free_range
+from dlo_gym.rod._kernels_tangent import empty_geometry, measure
 
 PARAMETERS = (
     "log_EI",
@@ -19,55 +24,188 @@ PARAMETERS = (
 )
 """Logarithms are natural; weight is the linear density; the length [m] carries mass with it."""
 
-STEP = 1e-4  # relative; the gradient is linear or nearly so in every parameter
+MOTION_PARAMETERS = (*PARAMETERS, "external_damping", "internal_damping")
+"""Those, of which the linear density now has inertia too, and the dampings [1/s], [s]."""
+
+DISPLACEMENT = tuple(
+    f"{side}_{axis}" for side in ("left", "right") for axis in ("dx", "dy", "dz", "rx", "ry", "rz")
+)
+"""Names of the columns that are an advance's clamp displacement."""
 
 
-def perturbed(rod: RodArrays, weight: Array, name: str, step: float) -> RodArrays:
-    """The rod with one parameter changed by ``step``; ``weight`` (n + 1, 3) [N] is of the nodes."""
-    if name == "log_EI":
-        scale = np.exp([step, step, 0.0])
-        stiffer = np.exp(step)
-        return rod._replace(
-            bending=rod.bending * scale,
-            yield_moment=rod.yield_moment * stiffer,
-            hardening=rod.hardening * stiffer,
+@dataclass(frozen=True, eq=False)
+class MotionSensitivity:
+    """Derivatives of a rod in motion by m quantities, one a column of the last axis.
+
+    Any columns can be put together by hand, such as those of a change of the initial state.
+
+    Attributes:
+        columns: (m,) their names; one of ``MOTION_PARAMETERS`` is that parameter of the rod, any
+            other is what the derivatives below say it is.
+        positions: (n_nodes, 3, m) of the nodes [m].
+        turns: (n_elements, 3, m) of the elements' frames, about d1, d2, d3 of each [rad].
+        velocities: (n_nodes, 3, m) of the nodes [m/s].
+        angular_velocities: (n_elements, 3, m) about d1, d2, d3 of each element [rad/s].
+        clamps: (12, m) of the clamp poses, world axes, left then right: translation [m], rotation
+            vector [rad]; the right one's are of no effect where that end is free.
+
+    Raises:
+        ValueError: naming the field that is not finite or of another shape than the columns ask.
+    """
+
+    columns: tuple[str, ...]
+    positions: Array
+    turns: Array
+    velocities: Array
+    angular_velocities: Array
+    clamps: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "columns", tuple(self.columns))
+        m, n = len(self.columns), len(self.turns)
+        shapes = {
+            "positions": (n + 1, 3, m),
+            "turns": (n, 3, m),
+            "velocities": (n + 1, 3, m),
+            "angular_velocities": (n, 3, m),
+            "clamps": (12, m),
+        }
+        for name, shape in shapes.items():
+            values = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            if values.shape != shape or not np.isfinite(values).all():
+                raise ValueError(
+                    f"{name}: expected finite values of shape {shape}, got {values.shape}"
+                )
+            object.__setattr__(self, name, values)
+
+    @classmethod
+    def zero(cls, columns: Sequence[str], n_elements: int) -> "MotionSensitivity":
+        """Of a state that no column changes."""
+        n, m = n_elements, len(columns)
+        return cls(
+            tuple(columns), np.zeros((n + 1, 3, m)), np.zeros((n, 3, m)), np.zeros((n + 1, 3, m)),
+            np.zeros((n, 3, m)), np.zeros((12, m)),
+        )  # fmt: skip
+
+    def of(self, column: str) -> Array:
+        """d(positions)/d(column), shape (n_nodes, 3).
+
+        Raises:
+            ValueError: if there is no such column.
+        """
+        if column not in self.columns:
+            raise ValueError(f"column: expected one of {self.columns}, got {column!r}")
+        return self.positions[:, :, self.columns.index(column)]
+
+
+def check_parameters(parameters: Sequence[str]) -> tuple[str, ...]:
+    """``parameters`` as a tuple.
+
+    Raises:
+        ValueError: if one is no parameter, or comes twice.
+    """
+    unknown = [name for name in parameters if name not in MOTION_PARAMETERS]
+    if unknown or len(set(parameters)) != len(parameters):
+        raise ValueError(
+            f"parameters: expected distinct ones of {MOTION_PARAMETERS}, got {tuple(parameters)}"
         )
-    if name == "log_GJ":
-        return rod._replace(bending=rod.bending * np.exp([0.0, 0.0, step]))
-    if name == "log_weight":
-        return rod._replace(forces=rod.forces + np.expm1(step) * weight)
-    if name == "length":
-        stretch = step / float(rod.rest_length.sum())
-        return rod._replace(
-            rest_length=rod.rest_length * (1.0 + stretch),
-            voronoi_length=rod.voronoi_length * (1.0 + stretch),
-            forces=rod.forces + stretch * weight,
-        )
-    axis = PARAMETERS.index(name) - PARAMETERS.index("rest_curvature_1")
-    return rod._replace(rest_curvature=rod.rest_curvature + step * np.eye(3)[axis])
+    return tuple(parameters)
 
 
 def parameter_sensitivity(
-    system: System, weight: Array, x: Array, q: Array, ends: Ends, work: Work
+    rod: RodArrays, weight: Array, x: Array, q: Array, ends: Ends, work: Work
 ) -> Array:
     """d(unknowns)/d(PARAMETERS), shape (n_dofs, 7), given the factors of H in ``work``.
 
-    H d(unknowns) = -d(gradient)/d(parameter), the right side by central differences of the
-    gradient at the shape as it is.
+    H d(unknowns) = -d(gradient)/d(parameter); ``weight`` (n + 1, 3) [N] is of the nodes.
     """
-    gradient = np.empty_like(work.gradient)
-    scratch = work._replace(gradient=gradient, clamp_terms=np.empty_like(work.clamp_terms))
-    columns = np.empty((len(gradient), len(PARAMETERS)))
-    for column, name in enumerate(PARAMETERS):
-        step = STEP * (float(system.rod.rest_length.sum()) if name == "length" else 1.0)
-        sides = []
-        for sign in (1.0, -1.0):
-            rod = perturbed(system.rod, weight, name, sign * step)
-            assemble(system._replace(rod=rod), x, q, ends, scratch, False)
-            sides.append(gradient.copy())
-        columns[:, column] = (sides[1] - sides[0]) / (2.0 * step)
-    first, last = free_range(len(q), ends.right_held)
+    n = len(q)
+    columns, geometry = np.empty((6 * n + 3, len(PARAMETERS))), empty_geometry(n)
+    measure(rod, x, q, ends, geometry)
+    explicit_gradient(rod, geometry, np.arange(len(PARAMETERS)), ends.right_held, weight, columns)
+    first, last = free_range(n, ends.right_held)
+    columns *= -1.0
     columns[:first] = 0.0
     columns[last:] = 0.0
     solve(work.band, first, last, columns)
     return columns
+
+
+def at_rest(parameters: Sequence[str], unknowns: Array) -> MotionSensitivity:
+    """Of an equilibrium between given clamps; ``unknowns`` (n_dofs, 7) are by PARAMETERS."""
+    start = MotionSensitivity.zero(check_parameters(parameters), (len(unknowns) - 3) // 6)
+    nodes, elements = 6 * np.arange(len(start.positions)), 6 * np.arange(len(start.turns)) + 3
+    for column, name in enumerate(start.columns):
+        if name in PARAMETERS:
+            change = unknowns[:, PARAMETERS.index(name)]
+            start.positions[:, :, column] = change[nodes[:, None] + np.arange(3)]
+            start.turns[:, :, column] = change[elements[:, None] + np.arange(3)]
+    return start
+
+
+def with_displacement(sensitivity: MotionSensitivity, n_clamps: int) -> MotionSensitivity:
+    """With columns for a displacement of the clamps that is still to come."""
+    names = DISPLACEMENT[: 6 * n_clamps]
+    later = MotionSensitivity.zero(names, len(sensitivity.turns))
+    return MotionSensitivity(
+        (*sensitivity.columns, *names),
+        *(
+            np.concatenate([getattr(sensitivity, name), getattr(later, name)], axis=-1)
+            for name in ("positions", "turns", "velocities", "angular_velocities", "clamps")
+        ),
+    )
+
+
+def carried_of(
+    sensitivity: MotionSensitivity,
+    rotations: Array,
+    internal_damping: float,
+    weight: Array,
+    velocity: Array,
+) -> Carried:
+    """What the kernels carry from ``sensitivity``.
+
+    Args:
+        sensitivity: of the rod's present state.
+        rotations: (2, 3, 3) R_world_clamp.
+        internal_damping: of the rod [s].
+        weight: (n + 1, 3) of the nodes [N].
+        velocity: (12, m) of the clamps in world axes, by every column [m/s, rad/s].
+    """
+    names, n = sensitivity.columns, len(sensitivity.turns)
+    codes = np.array(
+        [MOTION_PARAMETERS.index(name) if name in MOTION_PARAMETERS else -1 for name in names],
+        dtype=np.int64,
+    )
+    viscous = internal_damping > 0.0 or "internal_damping" in names
+    carried = empty_carried(n, codes, viscous, weight)
+    poses = sensitivity.clamps.reshape(2, 2, 3, -1)
+    carried.positions[:] = poses[:, 0]
+    carried.turns[:] = rotations.transpose(0, 2, 1) @ poses[:, 1]
+    carried.velocity[:] = velocity
+    unknowns = carried.now.unknowns
+    unknowns[:-3].reshape(n, 6, -1)[:, :3] = sensitivity.positions[:-1]
+    unknowns[-3:] = sensitivity.positions[-1]
+    unknowns[:-3].reshape(n, 6, -1)[:, 3:] = sensitivity.turns
+    carried.now.speeds[: n + 1] = sensitivity.velocities
+    carried.now.w[:] = sensitivity.angular_velocities
+    return carried
+
+
+def sensitivity_of(
+    columns: tuple[str, ...], carried: Carried, rotations: Array, duration: float
+) -> MotionSensitivity:
+    """What has been carried over ``duration`` [s] to clamps with ``rotations`` (2, 3, 3)."""
+    now, n = carried.now, len(carried.now.w)
+    elements = now.unknowns[:-3].reshape(n, 6, -1)
+    clamps = np.empty((2, 2, 3, len(columns)))
+    clamps[:, 0] = carried.positions + duration * carried.velocity.reshape(2, 2, 3, -1)[:, 0]
+    clamps[:, 1] = rotations @ now.turns
+    return MotionSensitivity(
+        columns,
+        np.concatenate([elements[:, :3], now.unknowns[None, -3:]]),
+        elements[:, 3:].copy(),
+        now.speeds[: n + 1].copy(),
+        now.w.copy(),
+        clamps.reshape(12, -1),
+    )
