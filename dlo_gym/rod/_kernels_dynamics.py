@@ -322,7 +322,10 @@ def advance(system, motion, path, ends, x, q, v, w, creep, plan, limits, work, c
             )
         if still and gain > 0.0:
             if carried is not None:
-                share_gain(system, motion, gain, new_kinetic, ends, now, before, carried, work)
+                share_gain(
+                    system, motion, gain, new_kinetic, limits.residual * limits.torque, ends,
+                    now, before, carried, work,
+                )  # fmt: skip
             scale = sqrt(max(0.0, 1.0 - gain / new_kinetic)) if new_kinetic > 0.0 else 0.0
             combine(scale, now.speeds, 0.0, now.speeds, now.speeds)
             combine(scale, now.w, 0.0, now.w, now.w)

@@ -42,7 +42,7 @@ def change_stress(rod, geometry, codes, eta, rate, stiffening, stress):
     strain = geometry.strain
     for c in range(codes.shape[0]):
         code = codes[c]
-        if code == LOG_EI or code == LOG_GJ:
+        if code in (LOG_EI, LOG_GJ):
             for i in range(n + 1):
                 for k in range(2) if code == LOG_EI else range(2, 3):
                     bent = strain[n + i, k] - rod.rest_curvature[i, k] + eta * rate[n + i, k]

@@ -4,8 +4,8 @@ A stage ends where its potential's gradient vanishes, so with H its Hessian ther
 
     H d(unknowns) = -(d(gradient)/d(parameters) + d(gradient)/d(b, c) d(b, c) + ... d(clamps))
 
-for every column, be it a parameter, a clamp's motion or a change of the initial state. All else in a
-step (``_kernels_dynamics``) is explicit and differentiated as it stands.
+for every column, be it a parameter, a clamp's motion or a change of the initial state. All else in
+a step (``_kernels_dynamics``) is explicit and differentiated as it stands.
 """
 
 from math import cos, sin, sqrt
@@ -218,7 +218,7 @@ def _differentiate_stage(
     base, d_base, stage, rod = scratch.base, carried.base, scratch.stage, system.rod
     geometry, columns, codes = carried.geometry, carried.columns, carried.codes
     ends = Ends(carried.frames, right_held)
-    n, m = moment.q.shape[0], codes.shape[0]
+    n = moment.q.shape[0]
     x = moment.places[: n + 1]
     first, last = free_range(n, right_held)
     length = rod.rest_length.sum()
@@ -339,7 +339,7 @@ def _differentiate_trapezoid_base(
     """Update ``scratch.base`` and its change to b = y + s v and c = v + s a(y)."""
     before, base, d_before, d_base = scratch.before, scratch.base, carried.before, carried.base
     geometry, codes = carried.geometry, carried.codes
-    n, m = before.q.shape[0], codes.shape[0]
+    m = codes.shape[0]
     ends = Ends(carried.frames, right_held)
     _move_clamps(path, time, right_held, carried, d_before)
     measure(system.rod, before.places, before.q, ends, geometry)
@@ -430,7 +430,7 @@ def _add_energy_change(system, motion, sign, moment, tangent, ends, carried, wor
     for c in range(m):
         code = codes[c]
         total = mass_change(code, length) * kinetic
-        if code == LENGTH or code == LOG_WEIGHT:
+        if code in (LENGTH, LOG_WEIGHT):
             share = 1.0 if code == LOG_WEIGHT else 1.0 / length
             for i in range(n + 1):
                 for k in range(3):
@@ -475,29 +475,29 @@ def _add_kinetic_change(motion, sign, moment, tangent, out):
 
 
 @njit(cache=True)
-def share_gain(system, motion, gain, kinetic, ends, now, before, carried, work):
-    """Update ``carried.now`` for the scale sqrt(1 - gain / kinetic) of the velocities ``now``."""
+def share_gain(system, motion, gain, kinetic, noise, ends, now, before, carried, work):
+    """Update ``carried.now`` for the velocities' scale sqrt(1 - gain / kinetic), not yet applied to
+    ``now``; a gain within the ``noise`` [J] of the solver counts as given."""
     d_now, m = carried.now, carried.codes.shape[0]
-    left = 1.0 - gain / kinetic if kinetic > 0.0 else 0.0
-    if left <= 0.0:
-        d_now.speeds[:] = 0.0
-        d_now.w[:] = 0.0
-        return
-    d_gain, d_kinetic = np.zeros(m), np.zeros(m)
-    _add_energy_change(system, motion, 1.0, now, d_now, ends, carried, work, d_gain)
-    _add_energy_change(system, motion, -1.0, before, carried.before, ends, carried, work, d_gain)
-    _add_kinetic_change(motion, 1.0, now, d_now, d_kinetic)
-    for c in range(m):
-        d_kinetic[c] += mass_change(carried.codes[c], system.rod.rest_length.sum()) * kinetic
-    scale = sqrt(left)
-    slope = -0.5 / (scale * kinetic)
+    scale = sqrt(max(0.0, 1.0 - gain / kinetic)) if kinetic > 0.0 else 0.0
+    change = np.zeros(m)  # of the scale
+    if gain > noise and scale > 0.0:
+        d_gain, d_kinetic = np.zeros(m), np.zeros(m)
+        _add_energy_change(system, motion, 1.0, now, d_now, ends, carried, work, d_gain)
+        _add_energy_change(
+            system, motion, -1.0, before, carried.before, ends, carried, work, d_gain
+        )
+        _add_kinetic_change(motion, 1.0, now, d_now, d_kinetic)
+        for c in range(m):
+            heavier = mass_change(carried.codes[c], system.rod.rest_length.sum())
+            lost = d_gain[c] - gain * (d_kinetic[c] / kinetic + heavier)
+            change[c] = -0.5 * lost / (scale * kinetic)
     for i in range(now.speeds.shape[0]):
         for k in range(3):
             for c in range(m):
-                change = slope * (d_gain[c] - gain / kinetic * d_kinetic[c])
-                d_now.speeds[i, k, c] = scale * d_now.speeds[i, k, c] + change * now.speeds[i, k]
+                speed = scale * d_now.speeds[i, k, c]
+                d_now.speeds[i, k, c] = speed + change[c] * now.speeds[i, k]
     for e in range(now.w.shape[0]):
         for k in range(3):
             for c in range(m):
-                change = slope * (d_gain[c] - gain / kinetic * d_kinetic[c])
-                d_now.w[e, k, c] = scale * d_now.w[e, k, c] + change * now.w[e, k]
+                d_now.w[e, k, c] = scale * d_now.w[e, k, c] + change[c] * now.w[e, k]
