@@ -16,7 +16,7 @@ from dlo_gym.rod import contact_dynamics
 from dlo_gym.rod._kernels_assembly import System
 from dlo_gym.rod._kernels_clamps import clamp_frame
 from dlo_gym.rod._kernels_dynamics import Plan
-from dlo_gym.rod._kernels_inertia import NO_INERTIA
+from dlo_gym.rod._kernels_inertia import NO_INERTIA, Inertia
 from dlo_gym.rod._kernels_moment import hidden_energy
 from dlo_gym.rod._kernels_rates import kinetic_energy
 from dlo_gym.rod._kernels_sensitivity import Carried
@@ -26,7 +26,7 @@ from dlo_gym.rod.contact import ContactModel, check_clamps
 from dlo_gym.rod.dynamics import clamp_path, damping_wrenches, empty_work, motion_of, plan_of
 from dlo_gym.rod.initial_shapes import hanging
 from dlo_gym.rod.obstacles import Obstacle, check_obstacles, on_the_way
-from dlo_gym.rod.properties import RodProperties
+from dlo_gym.rod.properties import RodProperties, per_element
 from dlo_gym.rod.sensitivity import (
     MOTION_PARAMETERS,
     PARAMETERS,
@@ -136,6 +136,36 @@ class CosseratRod:
     def path_dependent(self) -> bool:
         """Whether its shape at rest depends on the way there: it yields, or can touch something."""
         return self._motion.yields or self._contact.possible
+
+    def attract(self, targets: ArrayLike, stiffness: ArrayLike) -> None:
+        """Springs from the nodes to ``targets``, from the next ``settle`` on; zero ends them.
+
+        Args:
+            targets: (n_nodes, 3) [m].
+            stiffness: of all springs, or (n_nodes,) of each [N/m].
+
+        Raises:
+            ValueError: on a wrong shape or a value that is not finite, or negative stiffness.
+        """
+        targets = np.asarray(targets, dtype=np.float64)
+        if targets.shape != (self.n_nodes, 3) or not np.isfinite(targets).all():
+            raise ValueError(
+                f"targets: expected finite values of shape ({self.n_nodes}, 3), got {targets.shape}"
+            )
+        springs = per_element(stiffness, self.n_nodes)
+        if not (np.isfinite(springs) & (springs >= 0.0)).all():
+            raise ValueError(f"stiffness: expected finite values from 0 up [N/m], got {springs}")
+        if not springs.any():
+            self._system = System(self._arrays, NO_INERTIA)
+            return
+        directors = 2 * self.n_elements
+        self._system = System(
+            self._arrays,
+            Inertia(
+                np.concatenate([springs, np.zeros(directors)]),
+                np.concatenate([targets, np.zeros((directors, 3))]),
+            ),
+        )
 
     def settle(self, boundary: BoundaryPoses, start: ArrayLike | None = None) -> RodState:
         """Find the equilibrium between clamps from afar.

@@ -1,0 +1,1 @@
+"""What a cable is made of, found from how it moved."""

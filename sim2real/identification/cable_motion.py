@@ -1,0 +1,147 @@
+"""What was seen of a cable that clamps held and moved."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from dlo_gym.geometry.curves import resample
+from dlo_gym.geometry.se3 import Array
+from dlo_gym.recording import Recording
+from dlo_gym.rod.boundary import BoundaryPoses
+
+
+@dataclass(frozen=True, eq=False)
+class CableMotion:
+    """Points seen on a cable between clamps, over T samples.
+
+    Attributes:
+        stamps: (T,) [s], increasing.
+        left: (T, 4, 4) clamp poses at the cable's first end.
+        right: (T, 4, 4) at its last end; None where that end is free.
+        points: (T, n_points, 3) seen on the cable [m]; NaN where one was not seen.
+        places: (n_points,) of the points along the cable, from 0 at its first end to 1.
+        length: of the cable [m], as far as it is known.
+        radius: [m].
+        mass_per_length: [kg/m]; shapes and motion only tell ratios to it.
+        n_elements: of the rod that is to move like it.
+        clamp: "element" or "node", as ``CosseratRod`` has it.
+        across: whether points tell where the cable runs but not how far along it they are, as
+            those of a tracker: only their distance across the cable counts.
+
+    Raises:
+        ValueError: if shapes do not fit each other.
+    """
+
+    stamps: Array
+    left: Array
+    right: Array | None
+    points: Array
+    places: Array
+    length: float
+    radius: float
+    mass_per_length: float
+    n_elements: int = 50
+    clamp: Literal["element", "node"] = "element"
+    across: bool = False
+
+    def __post_init__(self) -> None:
+        n = len(self.stamps)
+        for name in ("left", "right"):
+            poses = getattr(self, name)
+            if poses is not None and poses.shape != (n, 4, 4):
+                raise ValueError(f"{name}: expected {n} poses, one per stamp, got {poses.shape}")
+        if self.points.shape != (n, len(self.places), 3):
+            raise ValueError(
+                f"points: expected shape ({n}, {len(self.places)}, 3), a row per stamp and a point"
+                f" per place, got {self.points.shape}"
+            )
+        if n < 2 or not (np.diff(self.stamps) > 0.0).all():
+            raise ValueError("stamps: expected two increasing times or more [s]")
+        if not np.isfinite(self.points).all(axis=2)[0].sum() >= 2:
+            raise ValueError("points: expected two points or more in the first sample")
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @classmethod
+    def of_recording(
+        cls, recording: Recording, centerline: Array, *, across: bool = False
+    ) -> "CableMotion":
+        """A recording's clamps with a ``centerline`` (T, n_nodes, 3): its truth or an estimate."""
+        n_nodes = centerline.shape[1]
+        density = recording.density or 1e3
+        return cls(
+            recording.stamps,
+            recording.clamp_left,
+            recording.clamp_right,
+            centerline,
+            np.linspace(0.0, 1.0, n_nodes),
+            recording.rod_length,
+            recording.rod_radius,
+            density * np.pi * recording.rod_radius**2,
+            n_nodes - 1,
+            across=across,
+        )
+
+    def boundary(self, sample: int) -> BoundaryPoses:
+        return BoundaryPoses(self.left[sample], None if self.right is None else self.right[sample])
+
+    def beginning(self, seconds: float) -> "CableMotion":
+        """Its first ``seconds`` [s], two samples at least."""
+        last = max(2, int(np.searchsorted(self.stamps, self.stamps[0] + seconds * (1 + 1e-9))))
+        right = None if self.right is None else self.right[:last]
+        return replace(
+            self, stamps=self.stamps[:last], left=self.left[:last], right=right,
+            points=self.points[:last],
+        )  # fmt: skip
+
+    @cached_property
+    def seen(self) -> Array:
+        """(T, n_points) bool."""
+        return np.isfinite(self.points).all(axis=2)
+
+    @cached_property
+    def weights(self) -> Array:
+        """(n_points, n_nodes) that interpolate the rod's nodes at the places."""
+        node = self.places * self.n_elements
+        below = np.minimum(node.astype(int), self.n_elements - 1)
+        rows = np.arange(len(node))
+        weights = np.zeros((len(node), self.n_elements + 1))
+        weights[rows, below] = 1.0 - (node - below)
+        weights[rows, below + 1] = node - below
+        return weights
+
+    @cached_property
+    def projectors(self) -> Array:
+        """(T, n_points, 3, 3) that take a distance to what counts of it; zero where not seen."""
+        projectors = np.zeros((*self.points.shape, 3))
+        for sample, seen in enumerate(self.seen):
+            projectors[sample, seen] = np.eye(3)
+            if self.across and seen.sum() > 1:
+                along = np.gradient(self.points[sample, seen], self.places[seen], axis=0)
+                along /= np.linalg.norm(along, axis=1, keepdims=True)
+                projectors[sample, seen] -= along[:, :, None] * along[:, None, :]
+        return projectors
+
+    def curve(self, sample: int) -> Array:
+        """(n_nodes, 3) of a smooth curve through both clamps and a sample's points [m]."""
+        ends = [self.left[sample, :3, 3]], [] if self.right is None else [self.right[sample, :3, 3]]
+        inner = (self.places > 0.0) & ((self.places < 1.0) | (self.right is None))
+        through = np.concatenate(
+            [part for part in (ends[0], self.points[sample, self.seen[sample] & inner], ends[1])
+             if len(part)]
+        )  # fmt: skip
+        return resample(through, self.n_elements + 1)
+
+    def difference(self, predicted: Array) -> Array:
+        """What counts of the distance of ``predicted`` points (T, n_points, 3) [m] from those
+        seen; zero where one was not seen."""
+        offset = np.where(self.seen[..., None], predicted - self.points, 0.0)
+        return np.einsum("tnij,tnj->tni", self.projectors, offset)
+
+    def rms(self, predicted: Array) -> float:
+        """Root mean square over points seen of that distance [m]."""
+        squares = (self.difference(predicted) ** 2).sum(axis=2)
+        return float(np.sqrt(squares.sum() / self.seen.sum()))
