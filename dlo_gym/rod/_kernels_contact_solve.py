@@ -187,11 +187,9 @@ def newton(system, x, q, ends, contact, limits, max_steps, work, matrix):
 
 
 @njit(cache=True)
-def descend(system, x, q, ends, contact, limits, max_steps, kick, work, matrix):
-    """Descend the potential from any shape (Levenberg's damped Newton), with lagging friction.
-
-    ``kick`` leaves a saddle: the first step answers a small force in a fixed, generic direction.
-    Returns a status and the steps taken.
+def descend(system, x, q, ends, contact, limits, max_steps, work, matrix):
+    """Descend the potential from any shape (Levenberg's damped Newton), with lagging friction and
+    predicted stresses. Returns a status and the steps taken.
     """
     n = q.shape[0]
     n_dofs = 6 * n + 3
@@ -207,9 +205,10 @@ def descend(system, x, q, ends, contact, limits, max_steps, kick, work, matrix):
     energy, whole, count = np.inf, False, 0
     for _ in range(4 * max_steps):
         # The shape is a trial: keep it if it is lower, else return to the last and damp more.
-        exact_stress(system.rod, x, q, work.stress)
+        if not whole:
+            exact_stress(system.rod, x, q, work.stress)
         trial, remote_trial = evaluate(system, x, q, ends, contact, work, matrix)
-        if trial < energy + 1e-13 * abs(energy) or (count <= 1 and kick):
+        if trial < energy + 1e-13 * abs(energy):
             count += 1
             damping = damping / 5.0 if whole else damping
             x_kept[:] = x
@@ -217,9 +216,7 @@ def descend(system, x, q, ends, contact, limits, max_steps, kick, work, matrix):
             gradient_kept[:] = gradient
             undamped[:] = matrix
             energy, remote = trial, remote_trial
-            if _residual(gradient, first, last, limits) < limits.residual and not (
-                kick and count == 1
-            ):
+            if _residual(gradient, first, last, limits) < limits.residual:
                 return CONVERGED, count
             if count > max_steps:
                 break
@@ -239,13 +236,11 @@ def descend(system, x, q, ends, contact, limits, max_steps, kick, work, matrix):
                 step[:] = 0.0
                 for j in range(first, last):
                     step[j, 0] = -gradient[j]
-                    if kick and count == 1:
-                        step[j, 0] = 1e-3 * limits.torque * np.cos(1.0 + 0.7 * j)
                 solve(matrix, factors, first, last, step)
                 slope = 0.0
                 for j in range(first, last):
                     slope += step[j, 0] * gradient[j]
-                if slope < 0.0 or (kick and count == 1):
+                if slope < 0.0:
                     break
             damping = max(4.0 * damping, 1e-9)
         if not damping < 1e12:

@@ -20,6 +20,7 @@ CONVERGED, STALLED, UNSTABLE = 0, 1, 2
 
 LARGEST_TURN = 0.7  # of an element in one Newton step [rad]; beyond, the quadratic model is void
 NEWTON_STEPS = 16
+NEUTRAL = 1e-9  # damping below which a negative curvature is rounding: a helix may slide along
 
 
 class Limits(NamedTuple):
@@ -214,8 +215,9 @@ def follow(system, x, q, ends, twist, clamp_rotations, limits, work):
 def minimise(system, x, q, ends, limits, max_steps, work):
     """Descend the potential from any shape to a stable equilibrium (Levenberg's damped Newton).
 
-    Every step lowers the energy; the Hessian is shifted until it is positive definite. Leaves
-    ``band`` factorised at the solution. Returns a status and the steps taken.
+    Every step lowers the energy; the Hessian, with stresses predicted as in ``follow``, is shifted
+    until it is positive definite. Leaves ``band`` factorised at the solution. Returns a status and
+    the steps taken.
     """
     rod, stress, gradient, band = system.rod, work.stress, work.gradient, work.band
     tolerance = limits.residual
@@ -225,16 +227,19 @@ def minimise(system, x, q, ends, limits, max_steps, work):
     rotation = limits.torque * n
     translation = rotation / rod.rest_length[0] ** 2
     damping = 1e-3
-    step = np.zeros(n_dofs)
+    step, scale = np.zeros(n_dofs), 1.0
     x_trial, q_trial = x.copy(), q.copy()
     exact_stress(rod, x, q, stress)
     energy = assemble(system, x, q, ends, work, True)
-    undamped = band.copy()
+    undamped, predicted = band.copy(), stress.copy()
     for count in range(max_steps):
         residual = _residual(gradient, first, last, limits)
         if residual < tolerance:
             band[:] = undamped
+            shift_diagonal(band, first, last, NEUTRAL * translation, NEUTRAL * rotation)
             if factorise(band, first, last) == 0:
+                band[:] = undamped
+                factorise(band, first, last)
                 return CONVERGED, count
         accepted = False
         for _ in range(60):
@@ -261,12 +266,15 @@ def minimise(system, x, q, ends, limits, max_steps, work):
                 damping = damping / 5.0 if scale == 1.0 else damping
                 break
             damping = max(4.0 * damping, 1e-9)
+            stress[:] = predicted
             assemble(system, x, q, ends, work, False)
         if not accepted:
             return STALLED, count
         x[:] = x_trial
         q[:] = q_trial
-        exact_stress(rod, x, q, stress)
+        if scale < 1.0:
+            exact_stress(rod, x, q, stress)
+        predicted[:] = stress
         energy = assemble(system, x, q, ends, work, True)
         undamped[:] = band
     return STALLED, max_steps

@@ -158,12 +158,12 @@ class ContactModel:
         system, x, q, _ = shape
         limits = self._within_rounding(system, limits)
         hold = Hold(self.anchors, np.zeros((*self.anchors.shape[:2], 4)), True)
-        rough, steps, kick = ROUGH * limits.residual, 0, False
+        rough, steps = ROUGH * limits.residual, 0
         while steps < max_steps:
             point_kernels.update_lag(self.constants, self.arrays, x, hold.lag)
             status, taken = kernels.descend(
                 *shape, self._contact(hold), limits._replace(residual=rough), max_steps - steps,
-                kick, work, self.matrix,
+                work, self.matrix,
             )  # fmt: skip
             steps += taken
             if status != CONVERGED:
@@ -174,14 +174,13 @@ class ContactModel:
                 *shape, self._contact(), limits, kernels.NEWTON_STEPS, work, self.matrix
             )
             steps += taken
-            kick = False
             if status == CONVERGED:
-                if self.linearise(shape, work)[1] == 0:
+                negative = self.linearise(shape, work)[1]
+                if negative == 0 or not self._leave_saddle(shape, hold, work):
                     return CONVERGED, steps
-                if self._leave_saddle(shape, hold, work):
-                    rough = limits.residual  # Newton's method might go back
-                    continue
-                kick = True
+                self.anchors[:] = near[2]
+                rough = limits.residual  # Newton's method might go back
+                continue
             x[:], q[:], self.anchors[:] = near
             rough = max(limits.residual, 1e-2 * rough)
         return STALLED, steps
@@ -203,7 +202,7 @@ class ContactModel:
         saddle = x.copy(), q.copy()
         exact_stress(system.rod, x, q, work.stress)
         energy, _ = kernels.evaluate(*shape, contact, work, self.matrix)
-        for turn in AWAY_FROM_SADDLE:
+        for turn in (sign * turn for turn in AWAY_FROM_SADDLE for sign in (1.0, -1.0)):
             kernels.step_within_reach(*shape, contact, turn * softest, work)
             lower, _ = kernels.evaluate(*shape, contact, work, self.matrix)
             if lower < energy - 1e-13 * abs(energy):

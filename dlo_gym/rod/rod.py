@@ -98,13 +98,14 @@ class CosseratRod:
         self._motion = motion_of(properties, n_elements, self._arrays.rest_curvature.copy())
         stiffness = float(self._arrays.bending[:, 0].mean())
         weight = float(np.abs(self._arrays.forces).sum())
-        # Differences of coordinates of about 1 m carry this much of rounding error in force.
-        element_stiffness = self._arrays.shear[:, 2].max() * n_elements / properties.length
-        rounding = 8.0 * np.finfo(np.float64).eps * element_stiffness
+        # Differences of coordinates of about 1 m carry this much of rounding error in the force
+        # times an element's length.
+        rounding = np.finfo(np.float64).eps * self._arrays.shear[:, 2].max()
+        element = properties.length / n_elements
         self._limits = kernels.Limits(
             residual=TOLERANCE,
-            force=stiffness / properties.length**2 + weight + rounding / TOLERANCE,
-            torque=stiffness / properties.length + weight * properties.length / n_elements,
+            force=stiffness / properties.length**2 + weight + 8.0 * rounding / element / TOLERANCE,
+            torque=stiffness / properties.length + weight * element + rounding / TOLERANCE,
         )
         softest = self._arrays.shear[:, 2].min()
         self._largest_strain = LARGEST_STRAIN + 3.0 * weight / softest
@@ -667,7 +668,10 @@ class CosseratRod:
             return f"an element is strained by {largest:.2g}, beyond {self._largest_strain:.2g}"
         bend = float((np.linalg.norm(curvature, axis=1) * self._arrays.voronoi_length).max())
         if not bend < LARGEST_BEND:
-            return f"neighbouring elements bend by {bend:.2g} rad, beyond {LARGEST_BEND:.2g}"
+            return (
+                f"neighbouring elements bend by {bend:.2g} rad, beyond {LARGEST_BEND:.2g}: more"
+                " elements may help"
+            )
         return self._contact.problem(self._x) if self._contact.possible else ""
 
     def _strains(self) -> tuple[Array, Array]:
