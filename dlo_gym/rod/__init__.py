@@ -1,5 +1,6 @@
 """The Cosserat rod."""
 
+from dlo_gym.rod.batch import BatchState, RodBatch
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.obstacles import Box, Capsule, Plane, Sphere
 from dlo_gym.rod.properties import RodProperties
@@ -7,12 +8,14 @@ from dlo_gym.rod.rod import CosseratRod
 from dlo_gym.rod.state import RodContact, RodState, ShapeEstimate
 
 __all__ = [
+    "BatchState",
     "BoundaryDisplacement",
     "BoundaryPoses",
     "Box",
     "Capsule",
     "CosseratRod",
     "Plane",
+    "RodBatch",
     "RodContact",
     "RodProperties",
     "RodState",

@@ -26,13 +26,13 @@ def rod_arrays(properties: RodProperties, n: int, gravity: Array, clamp: str) ->
     joint = (RIGID_JOINT if clamp == "element" else 0.5) * properties.length / n
     voronoi = np.full(n + 1, properties.length / n)
     voronoi[[0, -1]] = joint
-    bending = np.concatenate([elements[:1], between, elements[-1:]])
+    bending = np.ascontiguousarray(np.concatenate([elements[:1], between, elements[-1:]]))
     return RodArrays(
         rest_length,
         np.ascontiguousarray(shear),
         np.zeros((n, 3)),
         bending,
-        np.concatenate([rest[:1], rest, rest[-1:]]),
+        np.ascontiguousarray(np.concatenate([rest[:1], rest, rest[-1:]])),
         voronoi,
         node_weights(properties, n, gravity),
         np.zeros((n + 1, 2)),
