@@ -13,6 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.bench_rod import bytes_of
 from benchmarks.pyelastica_peer import PyElasticaRod
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod import BoundaryDisplacement, BoundaryPoses, CosseratRod, RodProperties
@@ -106,24 +107,8 @@ def main() -> None:
     for n in (25, 50, 100, 200, 400):
         rod = CosseratRod(thin, n, clamp="node")
         _, seconds = timed_advance(rod, actions[0], 0.025)
-        growth.add_row(str(n), f"{1e2 * seconds:.3f}", f"{memory(rod) / 1e3:.0f}")
+        growth.add_row(str(n), f"{1e2 * seconds:.3f}", f"{bytes_of(rod) / 1e3:.0f}")
     Console().print(growth)
-
-
-def memory(rod: CosseratRod) -> int:
-    """Bytes of the rod's arrays."""
-    found: dict[int, int] = {}
-
-    def count(value: object) -> None:
-        if isinstance(value, np.ndarray):
-            found[id(value)] = value.nbytes
-        elif isinstance(value, tuple):
-            for item in value:
-                count(item)
-
-    for value in vars(rod).values():
-        count(value)
-    return sum(found.values())
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The Cosserat rod."""
 
+from dlo_gym.rod.batch import BatchState, RodBatch
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.obstacles import Box, Capsule, Plane, Sphere
 from dlo_gym.rod.properties import RodProperties
@@ -8,6 +9,7 @@ from dlo_gym.rod.sensitivity import MotionSensitivity
 from dlo_gym.rod.state import RodContact, RodState, ShapeEstimate
 
 __all__ = [
+    "BatchState",
     "BoundaryDisplacement",
     "BoundaryPoses",
     "Box",
@@ -15,6 +17,7 @@ __all__ = [
     "CosseratRod",
     "MotionSensitivity",
     "Plane",
+    "RodBatch",
     "RodContact",
     "RodProperties",
     "RodState",

@@ -21,7 +21,7 @@ class System(NamedTuple):
     inertia: Inertia
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def assemble(system, x, q, ends, work, with_hessian):
     """Potential [J] of the shape x (n + 1, 3), q (n, 4); updates ``work`` but for its stress.
 

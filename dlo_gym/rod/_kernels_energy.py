@@ -12,11 +12,17 @@ increment in the element's own frame, R_e <- R_e exp(theta_e); so the Hessian's 
 is 8. A clamp is a frame joined to the end element by a short piece of the same rod.
 """
 
-from math import acos, cos, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+
+from dlo_gym.rod._kernels_bending import bending, plastic_flow
+from dlo_gym.rod._kernels_quaternions import (
+    log_factor,
+    quaternion_to_columns,
+    relative_quaternion,
+)
 
 
 class RodArrays(NamedTuple):
@@ -79,199 +85,6 @@ class Work(NamedTuple):
     gradient: np.ndarray
     band: np.ndarray
     clamp_terms: np.ndarray
-
-
-@njit(cache=True)
-def quaternion_to_columns(q, R):
-    """Update ``R`` (3, 3) with the rotation matrix of unit quaternion ``q`` wxyz (4,)."""
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    R[0, 0] = 1.0 - 2.0 * (y * y + z * z)
-    R[0, 1] = 2.0 * (x * y - w * z)
-    R[0, 2] = 2.0 * (x * z + w * y)
-    R[1, 0] = 2.0 * (x * y + w * z)
-    R[1, 1] = 1.0 - 2.0 * (x * x + z * z)
-    R[1, 2] = 2.0 * (y * z - w * x)
-    R[2, 0] = 2.0 * (x * z - w * y)
-    R[2, 1] = 2.0 * (y * z + w * x)
-    R[2, 2] = 1.0 - 2.0 * (x * x + y * y)
-
-
-@njit(cache=True)
-def relative_quaternion(a, b, out):
-    """Update ``out`` (4,) with conj(a) b, of the two the one with w >= 0."""
-    w = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
-    x = a[0] * b[1] - a[1] * b[0] - a[2] * b[3] + a[3] * b[2]
-    y = a[0] * b[2] + a[1] * b[3] - a[2] * b[0] - a[3] * b[1]
-    z = a[0] * b[3] - a[1] * b[2] + a[2] * b[1] - a[3] * b[0]
-    sign = 1.0 if w >= 0.0 else -1.0
-    out[0] = sign * w
-    out[1] = sign * x
-    out[2] = sign * y
-    out[3] = sign * z
-
-
-@njit(cache=True)
-def rotate(q, vx, vy, vz):
-    """Update unit quaternion ``q`` to q exp(v / 2): a turn by v [rad] in the body's own frame."""
-    angle = 0.5 * sqrt(vx * vx + vy * vy + vz * vz)
-    if angle > 1e-8:
-        scale = 0.5 * sin(angle) / angle
-        c = cos(angle)
-    else:
-        scale = 0.5
-        c = 1.0
-    x, y, z = scale * vx, scale * vy, scale * vz
-    a, b, d, e = q[0], q[1], q[2], q[3]
-    q[0] = a * c - b * x - d * y - e * z
-    q[1] = a * x + b * c + d * z - e * y
-    q[2] = a * y - b * z + d * c + e * x
-    q[3] = a * z + b * y - d * x + e * c
-    norm = 1.0 / sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    for i in range(4):
-        q[i] *= norm
-
-
-@njit(cache=True)
-def log_factor(w):
-    """g, g' and g'' for the rotation vector g(w) v of a unit quaternion (w, v), w >= 0."""
-    z = 0.5 * (1.0 - w)
-    if z < 0.02:
-        # Series of 2 arcsin(sqrt z) / sqrt(z (1 - z)); ratio of coefficients 2k / (2k + 1).
-        coefficient = 1.0
-        power = 1.0
-        value = 1.0
-        first = 0.0
-        second = 0.0
-        power_1 = 1.0
-        power_2 = 1.0
-        for k in range(1, 11):
-            coefficient *= 2.0 * k / (2.0 * k + 1.0)
-            if k > 1:
-                second += coefficient * k * (k - 1) * power_2
-                power_2 *= z
-            first += coefficient * k * power_1
-            power_1 *= z
-            power *= z
-            value += coefficient * power
-        return 2.0 * value, -first, 0.5 * second
-    s2 = 1.0 - w * w
-    g = 2.0 * acos(w) / sqrt(s2)
-    dg = (w * g - 2.0) / s2
-    return g, dg, (g + 3.0 * w * dg) / s2
-
-
-@njit(cache=True)
-def plastic_flow(m0, m1, B, plastic, yield_moment, hardening):
-    """Direction and amount of plastic curvature under the elastic trial moment (m0, m1).
-
-    Radial return with linear kinematic hardening (Simo and Hughes 1998, 3.3): the minimum over
-    the flow of elastic energy + H |plastic|^2 / 2 + yield moment |flow|.
-    """
-    s0, s1 = m0 - hardening * plastic[0], m1 - hardening * plastic[1]
-    size = sqrt(s0 * s0 + s1 * s1)
-    return s0 / size, s1 / size, (size - yield_moment) / (B + hardening), size
-
-
-@njit(cache=True)
-def _bending(q, rod, i, grad_a, grad_b, H_aa, H_bb, H_ab, with_hessian):
-    """Energy of the bend at node i; updates its derivatives by turns a and b of the frames beside.
-
-    ``q`` (4,) is the relative quaternion; a and b act as exp(-a/2) q exp(b/2).
-    """
-    B, rest, D, plastic = (
-        rod.bending[i],
-        rod.rest_curvature[i],
-        rod.voronoi_length[i],
-        rod.plastic[i],
-    )
-    w, v0, v1, v2 = q[0], q[1], q[2], q[3]
-    g, dg, ddg = log_factor(w)
-    m0 = B[0] * (g * v0 / D - rest[0] - plastic[0])
-    m1 = B[1] * (g * v1 / D - rest[1] - plastic[1])
-    m2 = B[2] * (g * v2 / D - rest[2])
-    B00, B01, B11 = B[0], 0.0, B[1]
-    energy = 0.0
-    yield_moment, hardening = rod.yield_moment[i], rod.hardening[i]
-    s0, s1 = m0 - hardening * plastic[0], m1 - hardening * plastic[1]
-    if s0 * s0 + s1 * s1 > yield_moment * yield_moment:
-        f0, f1, flow, size = plastic_flow(m0, m1, B[0], plastic, yield_moment, hardening)
-        m0 -= B[0] * flow * f0
-        m1 -= B[0] * flow * f1
-        along = f0 * plastic[0] + f1 * plastic[1] + 0.5 * flow
-        energy += D * flow * (yield_moment + hardening * along)
-        # Consistent tangent B (I - B / (B + H) f f - B flow / size (I - f f)).
-        across = B[0] * flow / size
-        less = B[0] / (B[0] + hardening) - across
-        B00 = B[0] * (1.0 - across - less * f0 * f0)
-        B11 = B[0] * (1.0 - across - less * f1 * f1)
-        B01 = -B[0] * less * f0 * f1
-    energy += 0.5 * D * (m0 * m0 / B[0] + m1 * m1 / B[1] + m2 * m2 / B[2])
-    V, centre = rod.viscous[i], rod.viscous_centre[i]
-    r0, r1, r2 = g * v0 / D - centre[0], g * v1 / D - centre[1], g * v2 / D - centre[2]
-    energy += 0.5 * D * (V[0] * r0 * r0 + V[1] * r1 * r1 + V[2] * r2 * r2)
-    m0 += V[0] * r0
-    m1 += V[1] * r1
-    m2 += V[2] * r2
-    m = (m0, m1, m2)
-    diagonal = (B00 + V[0], B11 + V[1], B[2] + V[2])
-    Bv = (diagonal[0] * v0 + B01 * v1, B01 * v0 + diagonal[1] * v1, diagonal[2] * v2)
-    mv = m0 * v0 + m1 * v1 + m2 * v2
-    E0, E1, E2, E3 = dg * mv, g * m0, g * m1, g * m2
-    # dq/da_i = -e_i q / 2 and dq/db_i = q e_i / 2, as 4 x 6 columns.
-    J = np.array(
-        (
-            (0.5 * v0, 0.5 * v1, 0.5 * v2, -0.5 * v0, -0.5 * v1, -0.5 * v2),
-            (-0.5 * w, -0.5 * v2, 0.5 * v1, 0.5 * w, -0.5 * v2, 0.5 * v1),
-            (0.5 * v2, -0.5 * w, -0.5 * v0, 0.5 * v2, 0.5 * w, -0.5 * v0),
-            (-0.5 * v1, 0.5 * v0, -0.5 * w, -0.5 * v1, 0.5 * v0, 0.5 * w),
-        )
-    )
-    for i in range(3):
-        grad_a[i] = E0 * J[0, i] + E1 * J[1, i] + E2 * J[2, i] + E3 * J[3, i]
-        grad_b[i] = E0 * J[0, i + 3] + E1 * J[1, i + 3] + E2 * J[2, i + 3] + E3 * J[3, i + 3]
-    if not with_hessian:
-        return energy
-    E_ww = ddg * mv + dg * dg * (Bv[0] * v0 + Bv[1] * v1 + Bv[2] * v2) / D
-    T = np.empty((4, 6))
-    for c in range(6):
-        T[0, c] = E_ww * J[0, c]
-    for k in range(3):
-        E_wk = dg * (m[k] + g * Bv[k] / D)
-        E_kk = diagonal[k] * g * g / D
-        for c in range(6):
-            T[0, c] += E_wk * J[k + 1, c]
-            T[k + 1, c] = E_wk * J[0, c] + E_kk * J[k + 1, c]
-    if B01 != 0.0:
-        for c in range(6):
-            T[1, c] += B01 * g * g / D * J[2, c]
-            T[2, c] += B01 * g * g / D * J[1, c]
-    spin = -0.25 * (E0 * w + E1 * v0 + E2 * v1 + E3 * v2)
-    for i in range(3):
-        for j in range(i + 1):
-            aa = 0.0
-            bb = 0.0
-            for k in range(4):
-                aa += J[k, i] * T[k, j]
-                bb += J[k, i + 3] * T[k, j + 3]
-            if i == j:
-                aa += spin
-                bb += spin
-            H_aa[i, j] = aa
-            H_aa[j, i] = aa
-            H_bb[i, j] = bb
-            H_bb[j, i] = bb
-    # Mixed second derivative of q: -e_i q e_j / 4; row i is e_i q = -2 dq/da_i.
-    for i in range(3):
-        r0, r1, r2, r3 = -2.0 * J[0, i], -2.0 * J[1, i], -2.0 * J[2, i], -2.0 * J[3, i]
-        H_ab[i, 0] = -0.25 * (-E0 * r1 + E1 * r0 + E2 * r3 - E3 * r2)
-        H_ab[i, 1] = -0.25 * (-E0 * r2 - E1 * r3 + E2 * r0 + E3 * r1)
-        H_ab[i, 2] = -0.25 * (-E0 * r3 + E1 * r2 - E2 * r1 + E3 * r0)
-        for j in range(3):
-            mixed = 0.0
-            for k in range(4):
-                mixed += J[k, i] * T[k, j + 3]
-            H_ab[i, j] += mixed
-    return energy
 
 
 @njit(cache=True)
@@ -407,21 +220,23 @@ def assemble_rod(rod, x, q, ends, work, with_hessian):
         before = ends.frames[0] if i == 0 else q[i - 1]
         after = ends.frames[1] if i == n else q[i]
         relative_quaternion(before, after, relative)
-        energy += _bending(
+        energy += bending(
             relative, rod, i, grad_a, grad_b, H_aa, H_bb, H_ab, with_hessian,
         )  # fmt: skip
         left, right = 6 * (i - 1) + 3, 6 * i + 3
         if i == 0:
-            clamp_terms[0, 0] = grad_a
             for j in range(3):
+                clamp_terms[0, 0, j] = grad_a[j]
                 for k in range(3):
                     clamp_terms[0, 1 + j, k] = H_ab[k, j]
         else:
             for k in range(3):
                 gradient[left + k] += grad_a[k]
         if i == n:
-            clamp_terms[1, 0] = grad_b
-            clamp_terms[1, 1:] = H_ab
+            for j in range(3):
+                clamp_terms[1, 0, j] = grad_b[j]
+                for k in range(3):
+                    clamp_terms[1, 1 + j, k] = H_ab[j, k]
         else:
             for k in range(3):
                 gradient[right + k] += grad_b[k]

@@ -1,6 +1,6 @@
 """Newton's method on the rod's energy: following a moving clamp, and settling from afar."""
 
-from math import sqrt
+from math import cos, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from dlo_gym.rod._kernels_banded import (
     solve,
     solve_one,
 )
-from dlo_gym.rod._kernels_energy import rotate
+from dlo_gym.rod._kernels_quaternions import rotate
 
 CONVERGED, STALLED, UNSTABLE = 0, 1, 2
 
@@ -98,6 +98,14 @@ def apply_step(rod, x, q, step, scale, stress):
 
 
 @njit(cache=True)
+def copy(source, out):
+    """Update ``out`` (m, k) with ``source`` of the same shape."""
+    for i in range(source.shape[0]):
+        for k in range(source.shape[1]):
+            out[i, k] = source[i, k]
+
+
+@njit(cache=True)
 def _largest_turn(step, n):
     largest = 0.0
     for e in range(n):
@@ -161,7 +169,7 @@ def sensitivity(work, clamp_rotations, right_held, columns):
             columns[6 * n + k, 6 + k] = 1.0
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def follow(system, x, q, ends, twist, clamp_rotations, limits, work):
     """Move the clamps by ``twist`` (12,) and update the shape to the new equilibrium.
 
@@ -205,76 +213,75 @@ def follow(system, x, q, ends, twist, clamp_rotations, limits, work):
         negative = factorise(band, first, last)
         if _residual(gradient, first, last, limits) < limits.residual:
             return (UNSTABLE if negative else CONVERGED), energy
-        step[:] = 0.0
-        for j in range(first, last):
-            step[j] = -gradient[j]
+        for j in range(n_dofs):
+            step[j] = -gradient[j] if first <= j < last else 0.0
     return STALLED, 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def minimise(system, x, q, ends, limits, max_steps, work):
     """Descend the potential from any shape to a stable equilibrium (Levenberg's damped Newton).
 
     Every step lowers the energy; the Hessian, with stresses predicted as in ``follow``, is shifted
-    until it is positive definite. Leaves ``band`` factorised at the solution. Returns a status and
-    the steps taken.
+    until it is positive definite. Leaves ``band`` factorised at the solution. Returns a status, the
+    potential [J] and the steps taken.
     """
-    rod, stress, gradient, band = system.rod, work.stress, work.gradient, work.band
+    stress, gradient, band = work.stress, work.gradient, work.band
     tolerance = limits.residual
     n = q.shape[0]
     n_dofs = 6 * n + 3
     first, last = free_range(n, ends.right_held)
     rotation = limits.torque * n
-    translation = rotation / rod.rest_length[0] ** 2
-    damping = 1e-3
-    step, scale = np.zeros(n_dofs), 1.0
-    x_trial, q_trial = x.copy(), q.copy()
-    exact_stress(rod, x, q, stress)
-    energy = assemble(system, x, q, ends, work, True)
-    undamped, predicted = band.copy(), stress.copy()
-    for count in range(max_steps):
-        residual = _residual(gradient, first, last, limits)
-        if residual < tolerance:
-            band[:] = undamped
-            shift_diagonal(band, first, last, NEUTRAL * translation, NEUTRAL * rotation)
-            if factorise(band, first, last) == 0:
-                band[:] = undamped
-                factorise(band, first, last)
-                return CONVERGED, count
-        accepted = False
-        for _ in range(60):
-            band[:] = undamped
-            shift_diagonal(band, first, last, damping * translation, damping * rotation)
-            if factorise(band, first, last) > 0:
-                damping = max(4.0 * damping, 1e-9)
-                continue
-            step[:] = 0.0
-            for j in range(first, last):
-                step[j] = -gradient[j]
-                if residual < tolerance:  # a saddle: leave it in a fixed, generic direction
-                    step[j] = 1e-3 * limits.torque * np.cos(1.0 + 0.7 * j)
-            solve_one(band, first, last, step)
-            turn = _largest_turn(step, n)
-            scale = min(1.0, 0.5 * LARGEST_TURN / max(turn, 1e-300))
-            x_trial[:] = x
-            q_trial[:] = q
-            apply_step(rod, x_trial, q_trial, step, scale, stress)
-            trial = assemble(system, x_trial, q_trial, ends, work, False)
-            floor = 1e-13 * abs(energy)
-            if trial < energy + floor or residual < tolerance:
-                accepted = True
-                damping = damping / 5.0 if scale == 1.0 else damping
-                break
+    translation = rotation / system.rod.rest_length[0] ** 2
+    damping, scale, saddle = 1e-3, 0.0, False
+    step = np.zeros(n_dofs)
+    exact_stress(system.rod, x, q, stress)
+    x_kept, q_kept, stress_kept = x.copy(), q.copy(), stress.copy()
+    undamped, downhill = np.zeros_like(band), np.zeros(n_dofs)
+    energy, count, refused = np.inf, 0, 0
+    while count <= max_steps and refused < 60:
+        # The shape is a trial: keep it if it is lower, else return to the last and damp more.
+        trial = assemble(system, x, q, ends, work, True)
+        if trial < energy + 1e-13 * abs(energy) or saddle:
+            energy, refused = trial, 0
+            copy(x, x_kept)
+            copy(q, q_kept)
+            copy(stress, stress_kept)
+            copy(band, undamped)
+            for j in range(n_dofs):
+                downhill[j] = -gradient[j]
+            if scale == 1.0:
+                damping /= 5.0
+            saddle = False
+            if _residual(gradient, first, last, limits) < tolerance:
+                shift_diagonal(band, first, last, NEUTRAL * translation, NEUTRAL * rotation)
+                if factorise(band, first, last) == 0:
+                    copy(undamped, band)
+                    factorise(band, first, last)
+                    return CONVERGED, energy, count
+                saddle = True  # leave it in a fixed, generic direction
+                for j in range(n_dofs):
+                    downhill[j] = 1e-3 * limits.torque * cos(1.0 + 0.7 * j)
+            count += 1
+        else:
+            copy(x_kept, x)
+            copy(q_kept, q)
+            copy(stress_kept, stress)
             damping = max(4.0 * damping, 1e-9)
-            stress[:] = predicted
-            assemble(system, x, q, ends, work, False)
-        if not accepted:
-            return STALLED, count
-        x[:] = x_trial
-        q[:] = q_trial
+            refused += 1
+        negative = 1
+        while negative > 0 and refused < 60:
+            copy(undamped, band)
+            shift_diagonal(band, first, last, damping * translation, damping * rotation)
+            negative = factorise(band, first, last)
+            if negative > 0:
+                damping = max(4.0 * damping, 1e-9)
+                refused += 1
+        for j in range(n_dofs):
+            step[j] = downhill[j] if first <= j < last else 0.0
+        solve_one(band, first, last, step)
+        scale = min(1.0, 0.5 * LARGEST_TURN / max(_largest_turn(step, n), 1e-300))
+        apply_step(system.rod, x, q, step, scale, stress)
         if scale < 1.0:
-            exact_stress(rod, x, q, stress)
-        predicted[:] = stress
-        energy = assemble(system, x, q, ends, work, True)
-        undamped[:] = band
-    return STALLED, max_steps
+            exact_stress(system.rod, x, q, stress)
+    return STALLED, energy, count - 1

@@ -26,7 +26,7 @@ def rod_arrays(properties: RodProperties, n: int, gravity: Array, clamp: str) ->
     joint = (RIGID_JOINT if clamp == "element" else 0.5) * properties.length / n
     voronoi = np.full(n + 1, properties.length / n)
     voronoi[[0, -1]] = joint
-    bending = np.concatenate([elements[:1], between, elements[-1:]])
+    bending = np.ascontiguousarray(np.concatenate([elements[:1], between, elements[-1:]]))
     return RodArrays(
         rest_length,
         np.ascontiguousarray(shear),

@@ -11,8 +11,9 @@ from dlo_gym.geometry.curves import parallel_transport
 from dlo_gym.geometry.se3 import Array, exp_so3, log_so3, matrix_to_quaternion
 from dlo_gym.rod import _kernels_dynamics as dynamics_kernels
 from dlo_gym.rod import _kernels_energy as energy_kernels
+from dlo_gym.rod import _kernels_move as move_kernels
 from dlo_gym.rod import _kernels_solve as kernels
-from dlo_gym.rod import contact_dynamics
+from dlo_gym.rod import contact_dynamics, contact_moves
 from dlo_gym.rod._kernels_assembly import System
 from dlo_gym.rod._kernels_clamps import clamp_frame
 from dlo_gym.rod._kernels_dynamics import Plan
@@ -25,7 +26,8 @@ from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.contact import ContactModel, check_clamps
 from dlo_gym.rod.dynamics import clamp_path, damping_wrenches, empty_work, motion_of, plan_of
 from dlo_gym.rod.initial_shapes import hanging
-from dlo_gym.rod.obstacles import Obstacle, check_obstacles, on_the_way
+from dlo_gym.rod.obstacles import Obstacle, check_obstacles
+from dlo_gym.rod.plausibility import problem_of
 from dlo_gym.rod.properties import RodProperties, per_element
 from dlo_gym.rod.sensitivity import (
     MOTION_PARAMETERS,
@@ -46,7 +48,6 @@ TOLERANCE = 1e-9  # residual relative to the rod's own weight and stiffness
 LARGEST_STRAIN = 0.25  # beside what a few times the rod's own weight stretches
 LARGEST_BEND = 2.4  # between neighbouring elements [rad]
 LARGEST_MOVE = (0.08, 0.3)  # of one sub-step: translation per rod length, rotation [rad]
-SMALLEST_SUBSTEP = 1.0 / 64.0
 
 
 class CosseratRod:
@@ -108,15 +109,26 @@ class CosseratRod:
             torque=stiffness / properties.length + weight * element + rounding / TOLERANCE,
         )
         softest = self._arrays.shear[:, 2].min()
-        self._largest_strain = LARGEST_STRAIN + 3.0 * weight / softest
+        self._bounds = move_kernels.Bounds(
+            translation=LARGEST_MOVE[0] * properties.length,
+            rotation=LARGEST_MOVE[1],
+            strain=LARGEST_STRAIN + 3.0 * weight / softest,
+            bend=LARGEST_BEND,
+        )
         self._work = empty_work(n_elements)
         self._boundary: BoundaryPoses | None = None
+        self._energy = 0.0
         self._contact = ContactModel(properties, n_elements, obstacles, self_contact, friction)
         self._stop()
 
     @property
     def n_nodes(self) -> int:
         return self.n_elements + 1
+
+    @property
+    def settled(self) -> bool:
+        """Whether the rod has a state."""
+        return self._boundary is not None
 
     def apply_forces(self, forces: ArrayLike) -> None:
         """Dead loads (n_nodes, 3) [N] on the nodes beside the weight, from the next solve on.
@@ -199,7 +211,7 @@ class CosseratRod:
             positions[-1] = boundary.right[:3, 3]
         self._set(positions, _frames_along(positions, boundary), boundary)
         self._contact.let_go()
-        problem = self._minimise()
+        problem, _ = self._go(np.zeros(12), descend=True)
         if problem:
             if former is not None:
                 self.restore(former)
@@ -229,35 +241,23 @@ class CosseratRod:
         """
         before = self._settled("move")
         target = before.displaced(displacement)
-        standing = self._contact.obstacles
-        moved = standing if obstacles is None else self._contact.check_same(obstacles)
-        self._check_boundary(target, moved)
-        saved = self.state
+        if obstacles is not None:
+            obstacles = self._contact.check_same(obstacles)
+        self._check_boundary(target, self._contact.obstacles if obstacles is None else obstacles)
+        twist = np.zeros(12)
+        twist[: len(displacement.vector)] = displacement.vector
+        problem, reached = self._go(twist, obstacles=obstacles)
+        if problem:
+            raise RodDiverged(
+                f"the equilibrium was lost at {100 * reached:.0f} % of a move by"
+                f" {np.array2string(displacement.vector, precision=4, max_line_width=200)}"
+                f" [m, rad]: {problem}",
+                last_good=self.state,
+            )
+        self._boundary = target
+        self._rotations[:] = self._clamps[:, :3, :3]
         self._v, self._w = np.zeros((self.n_nodes, 3)), np.zeros((self.n_elements, 3))
         self._spins = np.zeros((2, 3))
-        vector = displacement.vector
-        full_stride = 1.0 / max(1.0, np.ceil(self._move_size(vector)))
-        done, stride = 0.0, full_stride
-        while done < 1.0:
-            reached = done + stride if done + stride < 1.0 - 1e-9 else 1.0
-            end = target if reached == 1.0 else before.displaced(displacement.scaled(reached))
-            bodies = None if obstacles is None else on_the_way(standing, moved, reached)
-            if self._follow(end, (reached - done) * vector, bodies):
-                done = reached
-                continue
-            stride *= 0.5
-            if stride >= SMALLEST_SUBSTEP * full_stride:
-                continue
-            problem = self._jump(end, bodies)
-            if problem:
-                self.restore(saved)
-                raise RodDiverged(
-                    f"the equilibrium was lost at {100 * reached:.0f} % of a move by"
-                    f" {np.array2string(vector, precision=4, max_line_width=200)} [m, rad]:"
-                    f" {problem}",
-                    last_good=saved,
-                )
-            done, stride = reached, full_stride
         return self.state
 
     def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
@@ -276,7 +276,7 @@ class CosseratRod:
         check_clamps(self._boundary, obstacles, self._contact.radii)
         former = self.state
         self._contact.replace(obstacles)
-        problem = self._minimise()
+        problem, _ = self._go(np.zeros(12), descend=True)
         if problem:
             self.restore(former)
             raise RodDiverged(f"no equilibrium among the obstacles: {problem}", last_good=former)
@@ -580,8 +580,10 @@ class CosseratRod:
         self._boundary = boundary
         self._rotations, frames = np.empty((2, 3, 3)), np.empty((2, 4))
         right = boundary.left if boundary.right is None else boundary.right
-        clamp_frame(boundary.left, self._rotations[0], frames[0])
-        clamp_frame(right, self._rotations[1], frames[1])
+        self._clamps = np.empty((2, 4, 4))
+        self._clamps[0], self._clamps[1] = boundary.left, right
+        for side in range(2):
+            clamp_frame(self._clamps[side], self._rotations[side], frames[side])
         self._ends = energy_kernels.Ends(frames, boundary.right is not None)
 
     @property
@@ -596,83 +598,34 @@ class CosseratRod:
         self._energy = self._stored(potential)
         return negative
 
-    def _minimise(self) -> str:
-        """Settle from the present shape; returns what is wrong with the result, or ""."""
+    def _go(
+        self,
+        twist: Array,
+        *,
+        descend: bool = False,
+        obstacles: Sequence[Obstacle] | None = None,
+    ) -> tuple[str, float]:
+        """Move by ``twist`` (12,), or ``descend`` from any shape: what is wrong, and where."""
+        held = move_kernels.Held(
+            self._system, self._motion, self._x, self._q, self._creep, self._clamps, self._ends,
+            self._limits, self._bounds, self._work,
+        )  # fmt: skip
         if self._contact.possible:
-            status, steps = self._contact.minimise(self._shape, self._limits, 2000, self._work)
-        else:
-            status, steps = kernels.minimise(*self._shape, self._limits, 2000, self._work)
-        self._linearise()
-        if status != kernels.CONVERGED:
-            return f"no convergence in {steps} Newton steps"
-        return self._implausible()
-
-    def _follow(
-        self, end: BoundaryPoses, twist: Array, obstacles: Sequence[Obstacle] | None
-    ) -> bool:
-        """One sub-step to ``end``; on failure the rod is as before."""
-        x, q, stress = self._x.copy(), self._q.copy(), self._work.stress.copy()
-        self._flow()
-        contact = self._contact.save()
-        before, energy, wrenches = self._boundary, self._energy, self._wrenches()
-        assert before is not None
-        rotations = self._rotations
-        self._set_clamps(end)
-        full_twist = np.zeros(12)
-        full_twist[: len(twist)] = twist
-        if self._contact.possible:
-            status, energy_after = self._contact.follow(
-                self._shape, full_twist, rotations, obstacles, self._limits, self._work
+            problem, reached, self._energy = contact_moves.move(
+                self._contact, held, self._energy, twist, descend, obstacles
             )
-        else:
-            status, energy_after = kernels.follow(
-                *self._shape, full_twist, rotations, self._limits, self._work
-            )
-        if status == kernels.CONVERGED:
-            # The clamps' work bounds the energy's rise; more means another branch was reached.
-            work = 0.5 * full_twist @ (wrenches + self._wrenches()).ravel()
-            slack = abs(work) + 1e-3 * self._limits.torque
-            bounded = obstacles is not None or energy_after - energy <= work + slack
-            if bounded and not self._implausible():
-                self._energy = self._stored(energy_after)
-                return True
-        self._set(x, q, before)
-        self._contact.load(contact)
-        self._work.stress[:] = stress
-        self._linearise()
-        return False
-
-    def _move_size(self, vector: Array) -> float:
-        """A move's size in sub-steps that Newton's method takes with ease."""
-        ends = vector.reshape(-1, 2, 3)
-        translation, rotation = np.linalg.norm(ends, axis=-1).max(axis=0)
-        return max(
-            translation / (LARGEST_MOVE[0] * self.properties.length), rotation / LARGEST_MOVE[1]
-        )
-
-    def _jump(self, end: BoundaryPoses, obstacles: Sequence[Obstacle] | None) -> str:
-        """Past a loss of stability: descend to the equilibrium that the rod snaps to."""
-        self._set_clamps(end)
-        before = self._x.copy()
-        self._x[0] = end.left[:3, 3]
-        if end.right is not None:
-            self._x[-1] = end.right[:3, 3]
-        if self._contact.possible and not self._contact.place(before, self._x, obstacles):
-            return "an obstacle is in the way"
-        return self._minimise()
+            return problem, reached
+        outcome = move_kernels.move(held, self._energy, twist, descend)
+        self._energy = outcome.energy
+        return problem_of(outcome.status, outcome.measure, self._bounds), outcome.reached
 
     def _implausible(self) -> str:
-        strain, curvature = self._strains()
-        largest = float(np.abs(strain).max())
-        if not largest < self._largest_strain:
-            return f"an element is strained by {largest:.2g}, beyond {self._largest_strain:.2g}"
-        bend = float((np.linalg.norm(curvature, axis=1) * self._arrays.voronoi_length).max())
-        if not bend < LARGEST_BEND:
-            return (
-                f"neighbouring elements bend by {bend:.2g} rad, beyond {LARGEST_BEND:.2g}: more"
-                " elements may help"
-            )
-        return self._contact.problem(self._x) if self._contact.possible else ""
+        """What is wrong with the present shape, or ""."""
+        status, measure = move_kernels.plausible(self._arrays, *self._strains(), self._bounds)
+        problem = problem_of(status, measure, self._bounds)
+        if problem or not self._contact.possible:
+            return problem
+        return self._contact.problem(self._x)
 
     def _strains(self) -> tuple[Array, Array]:
         """Strain (n, 3) of the elements and curvature (n + 1, 3) at nodes, clamps' included."""

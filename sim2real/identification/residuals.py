@@ -69,7 +69,10 @@ class Residuals:
         if self._jacobian is None:
             here = self._of(self._points)
             self._jacobian = np.column_stack(
-                [(self._of(self._in_motion(z + step)) - here) / STEP for step in STEP * np.eye(len(z))]
+                [
+                    (self._of(self._in_motion(z + step)) - here) / STEP
+                    for step in STEP * np.eye(len(z))
+                ]
             )
         return self._jacobian
 

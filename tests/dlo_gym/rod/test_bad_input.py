@@ -155,10 +155,6 @@ REFUSED = {
     "move before settling": (lambda: rod().move(STILL), r"move: .*call settle\(boundary\) first"),
     "advance before settling": (lambda: rod().advance(STILL, 0.1), r"advance: .*call settle"),
     "sensitivity before settling": (lambda: rod().sensitivity(), r"sensitivity: .*call settle"),
-    "parameters in contact": (
-        lambda: settled(obstacles=[Plane()]).parameter_sensitivity(),
-        "parameter_sensitivity: expected a rod that can touch nothing",
-    ),
     "move of one clamp of two": (
         lambda: settled().move(ONE_STILL),
         "displacement: must move the right clamp exactly if it exists, got right=None",

@@ -222,7 +222,7 @@ def test_held_nodes_have_the_clamps_velocity():
 def test_lost_motion_restores_the_state(monkeypatch):
     rod = swung(1, RodProperties(LENGTH))
     before = rod.state
-    monkeypatch.setattr("dlo_gym.rod.rod.LARGEST_BEND", 1e-6)
+    monkeypatch.setattr(rod, "_bounds", rod._bounds._replace(bend=1e-6))
     with pytest.raises(RodDiverged, match="lost .* s into an advance of 0.1 s") as caught:
         rod.advance(BOTH_STILL, 0.1, dt=0.05)
     np.testing.assert_array_equal(rod.state.positions, before.positions)
