@@ -125,11 +125,6 @@ class CosseratRod:
         self._arrays = self._arrays._replace(forces=weight + forces)
         self._system = self._system._replace(rod=self._arrays)
 
-    @property
-    def path_dependent(self) -> bool:
-        """Whether its shape at rest depends on the way there: it yields, or can touch something."""
-        return self._motion.yields or self._contact.possible
-
     def settle(self, boundary: BoundaryPoses, start: ArrayLike | None = None) -> RodState:
         """Find the equilibrium between clamps from afar.
 
@@ -338,6 +333,11 @@ class CosseratRod:
             time=self._time,
             contact=self._contact.state(self._x) if self._contact.possible else None,
         )
+
+    @property
+    def path_dependent(self) -> bool:
+        """Whether its shape at rest depends on the way there: it yields, or can touch something."""
+        return self._motion.yields or self._contact.possible
 
     def restore(self, state: RodState) -> None:
         """Return to ``state`` exactly: what follows is the same to the last bit.
