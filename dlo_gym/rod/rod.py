@@ -145,11 +145,6 @@ class CosseratRod:
         self._arrays = self._arrays._replace(forces=weight + forces)
         self._system = self._system._replace(rod=self._arrays)
 
-    @property
-    def path_dependent(self) -> bool:
-        """Whether its shape at rest depends on the way there: it yields, or can touch something."""
-        return self._motion.yields or self._contact.possible
-
     def attract(self, targets: ArrayLike, stiffness: ArrayLike) -> None:
         """Springs from the nodes to ``targets``, from the next ``settle`` on; zero ends them.
 
@@ -475,6 +470,11 @@ class CosseratRod:
             time=self._time,
             contact=self._contact.state(self._x) if self._contact.possible else None,
         )
+
+    @property
+    def path_dependent(self) -> bool:
+        """Whether its shape at rest depends on the way there: it yields, or can touch something."""
+        return self._motion.yields or self._contact.possible
 
     def restore(self, state: RodState) -> None:
         """Return to ``state`` exactly: what follows is the same to the last bit.

@@ -41,7 +41,9 @@ def test_goals_are_reachable_apart_and_off_the_straight_way(cell):
 
 
 # The ways round obstacles have a test of their own, in test_obstacle_env.
-@pytest.mark.parametrize("task", [task for task in dlo_gym.SHAPE_TASKS if task != "Obstacle"])
+@pytest.mark.parametrize(
+    "task", [task for task, options in dlo_gym.SHAPE_TASKS.items() if "obstacles" not in options]
+)
 def test_the_way_to_a_goal_is_one_that_the_environment_allows(task, monkeypatch):
     env = gym.make(f"dlo_gym/ShapeControl{task}-v0").unwrapped
     follow, legs = goals._follow, []
