@@ -48,11 +48,11 @@ def straight_way(env, goal_boundary):
 
 @pytest.mark.parametrize("touch", ["forbidden", "allowed"])
 def test_the_first_obstacle_stands_in_the_straight_way_and_the_start_is_clear(touch, monkeypatch):
-    goals = []
+    ends = []
     far_enough = tasks.far_enough
 
     def recorded(cell, start, config):
-        goals.append(cell.boundary)
+        ends.append(cell.boundary)
         return far_enough(cell, start, config)
 
     monkeypatch.setattr(tasks, "far_enough", recorded)
@@ -68,7 +68,7 @@ def test_the_first_obstacle_stands_in_the_straight_way_and_the_start_is_clear(to
         )
         start = cell.save()
         cell.place_obstacles(cell.obstacles[:1])
-        touched, reasons = straight_way(env, goals[-1])
+        touched, reasons = straight_way(env, ends[-1])
         assert touched or "collision" in reasons or "unreachable" in reasons
         if touch == "forbidden":
             assert reasons
