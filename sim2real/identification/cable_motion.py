@@ -69,7 +69,7 @@ class CableMotion:
             )
         if n < 2 or not (np.diff(self.stamps) > 0.0).all():
             raise ValueError("stamps: expected two increasing times or more [s]")
-        if not np.isfinite(self.points).all(axis=2)[0].sum() >= 2:
+        if np.count_nonzero(self.seen[0]) < 2:
             raise ValueError("points: expected two points or more in the first sample")
 
     def __len__(self) -> int:
