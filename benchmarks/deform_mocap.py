@@ -67,6 +67,7 @@ def _motion(clip: Array, between: Array) -> CableMotion:
         MASS_PER_LENGTH,
         ELEMENTS,
         clamp="node",
+        grip_known=False,
     )
 
 

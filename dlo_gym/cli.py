@@ -24,6 +24,10 @@ COMMANDS = {
         "score shape predictors on rods of other stiffness",
     ),
     "train-rl": ("control.rl:train_rl", "train a policy with SAC and HER"),
+    "identify": (
+        "sim2real.identify:identify",
+        "find stiffness, rest curvature and length of a recorded cable",
+    ),
     "robot init": ("sim2real.templates:init", "write a cell file to start from"),
     "robot check": ("sim2real.check:check", "connect to a cell, check every part, move nothing"),
     "robot run": ("sim2real.run:run", "steer the cable of a cell to a goal shape"),

@@ -39,6 +39,7 @@ from dlo_gym.rod.sensitivity import (
     parameter_gradient,
     parameter_sensitivity,
     sensitivity_of,
+    with_clamps,
     with_displacement,
 )
 from dlo_gym.rod.state import RodMemory, RodState
@@ -360,7 +361,11 @@ class CosseratRod:
         return state, after
 
     def motion_sensitivity(
-        self, parameters: Sequence[str] = MOTION_PARAMETERS, *, equilibrium: bool = True
+        self,
+        parameters: Sequence[str] = MOTION_PARAMETERS,
+        *,
+        equilibrium: bool = True,
+        by_clamps: bool = False,
     ) -> MotionSensitivity:
         """The present state's derivatives by ``parameters``, for ``advance_with_sensitivity``.
 
@@ -368,6 +373,8 @@ class CosseratRod:
             parameters: of ``sensitivity.MOTION_PARAMETERS``.
             equilibrium: whether the rod is at rest, in a state that depends on the parameters; if
                 not, the state is one given, whatever the parameters.
+            by_clamps: whether to append columns for twists of the clamps that hold the equilibrium,
+                named ``sensitivity.DISPLACEMENT``.
 
         Raises:
             ValueError: naming the argument; or if the rod has not settled, yields, creeps, can
@@ -380,7 +387,12 @@ class CosseratRod:
             return MotionSensitivity.zero(names, self.n_elements)
         if self._v.any() or self._w.any():
             raise ValueError("equilibrium: expected False for a rod in motion, got True")
-        return at_rest(names, self._by_parameters())
+        rest = at_rest(names, self._by_parameters())
+        if not by_clamps:
+            return rest
+        columns = np.empty((len(self._work.gradient), 12))
+        kernels.sensitivity(self._work, self._rotations, self._ends.right_held, columns)
+        return with_clamps(rest, columns[:, : 6 * (1 + self._ends.right_held)])
 
     def _check_smooth(self, action: str) -> None:
         if self._contact.possible or self._motion.yields or self._motion.creep > 0.0:

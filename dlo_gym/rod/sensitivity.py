@@ -164,6 +164,19 @@ def with_displacement(sensitivity: MotionSensitivity, n_clamps: int) -> MotionSe
     )
 
 
+def with_clamps(sensitivity: MotionSensitivity, unknowns: Array) -> MotionSensitivity:
+    """With columns for the twists of the clamps that hold an equilibrium, whose ``unknowns``
+    (n_dofs, 6 or 12) have those derivatives."""
+    whole = with_displacement(sensitivity, unknowns.shape[1] // 6)
+    added = slice(len(sensitivity.columns), None)
+    n = len(whole.turns)
+    elements = unknowns[:-3].reshape(n, 6, -1)
+    whole.positions[:-1, :, added], whole.positions[-1, :, added] = elements[:, :3], unknowns[-3:]
+    whole.turns[..., added] = elements[:, 3:]
+    whole.clamps[: unknowns.shape[1], added] = np.eye(unknowns.shape[1])
+    return whole
+
+
 def carried_of(
     sensitivity: MotionSensitivity,
     moving: int,

@@ -1,15 +1,22 @@
 """What was seen of a cable that clamps held and moved."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.signal import savgol_filter
 
 from dlo_gym.geometry.curves import resample
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.recording import Recording
 from dlo_gym.rod.boundary import BoundaryPoses
+
+PARABOLA = 0.12  # [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +36,8 @@ class CableMotion:
         clamp: "element" or "node", as ``CosseratRod`` has it.
         across: whether points tell where the cable runs but not how far along it they are, as
             those of a tracker: only their distance across the cable counts.
+        grip_known: whether the clamp poses are the cable's own; if not, each holds it turned by a
+            rotation that stays the same.
 
     Raises:
         ValueError: if shapes do not fit each other.
@@ -45,6 +54,7 @@ class CableMotion:
     n_elements: int = 50
     clamp: Literal["element", "node"] = "element"
     across: bool = False
+    grip_known: bool = True
 
     def __post_init__(self) -> None:
         n = len(self.stamps)
@@ -59,7 +69,7 @@ class CableMotion:
             )
         if n < 2 or not (np.diff(self.stamps) > 0.0).all():
             raise ValueError("stamps: expected two increasing times or more [s]")
-        if not np.isfinite(self.points).all(axis=2)[0].sum() >= 2:
+        if np.count_nonzero(self.seen[0]) < 2:
             raise ValueError("points: expected two points or more in the first sample")
 
     def __len__(self) -> int:
@@ -88,19 +98,33 @@ class CableMotion:
     def boundary(self, sample: int) -> BoundaryPoses:
         return BoundaryPoses(self.left[sample], None if self.right is None else self.right[sample])
 
-    def beginning(self, seconds: float) -> "CableMotion":
-        """Its first ``seconds`` [s], two samples at least."""
-        last = max(2, int(np.searchsorted(self.stamps, self.stamps[0] + seconds * (1 + 1e-9))))
-        right = None if self.right is None else self.right[:last]
-        return replace(
-            self, stamps=self.stamps[:last], left=self.left[:last], right=right,
-            points=self.points[:last],
-        )  # fmt: skip
+    def held(self, rotations: Sequence[Array]) -> "CableMotion":
+        """With clamps that hold the cable turned by rotations (3, 3) R_clamp_held, left and
+        right."""
+        turned = {}
+        for side, rotation in zip(("left", "right"), rotations, strict=False):
+            poses = getattr(self, side).copy()
+            poses[:, :3, :3] = poses[:, :3, :3] @ rotation
+            turned[side] = poses
+        return replace(self, **turned) if turned else self
+
+    def windows(self, seconds: float) -> list["CableMotion"]:
+        """Its parts of about ``seconds`` [s] one after the other, as motions of their own."""
+        duration = self.stamps[-1] - self.stamps[0]
+        n_parts = max(1, min(round(duration / seconds), len(self) // 2))
+        edges = np.round(np.linspace(0, len(self), n_parts + 1)).astype(int)
+        return [
+            replace(
+                self, stamps=self.stamps[a:b], left=self.left[a:b],
+                right=None if self.right is None else self.right[a:b], points=self.points[a:b],
+            )
+            for a, b in pairwise(edges)
+        ]  # fmt: skip
 
     @cached_property
-    def seen(self) -> Array:
-        """(T, n_points) bool."""
-        return np.isfinite(self.points).all(axis=2)
+    def seen(self) -> NDArray[np.bool_]:
+        """(T, n_points)."""
+        return ~np.isnan(self.points[..., 0])
 
     @cached_property
     def weights(self) -> Array:
@@ -125,6 +149,25 @@ class CableMotion:
                 projectors[sample, seen] -= along[:, :, None] * along[:, None, :]
         return projectors
 
+    @cached_property
+    def accelerations(self) -> Array:
+        """(T, n_nodes, 3) of the rod's nodes [m/s^2], from parabolas over ``PARABOLA`` of time."""
+        inner = (self.places > 0.0) & (self.places < 1.0)
+        tracks = [self.left[:, None, :3, 3], _filled(self.points[:, inner], self.seen[:, inner])]
+        places = [[0.0], self.places[inner]]
+        if self.right is not None:
+            tracks.append(self.right[:, None, :3, 3])
+            places.append([1.0])
+        period = float(np.median(np.diff(self.stamps)))
+        window = max(3, 2 * round(0.5 * PARABOLA / period) + 1)
+        if window > len(self):
+            return np.zeros((len(self), self.n_elements + 1, 3))
+        seen = savgol_filter(
+            np.concatenate(tracks, axis=1), window, 2, deriv=2, delta=period, axis=0
+        )
+        nodes = np.linspace(0.0, 1.0, self.n_elements + 1)
+        return CubicSpline(np.concatenate(places), seen, axis=1)(nodes)
+
     def curve(self, sample: int) -> Array:
         """(n_nodes, 3) of a smooth curve through both clamps and a sample's points [m]."""
         ends = [self.left[sample, :3, 3]], [] if self.right is None else [self.right[sample, :3, 3]]
@@ -141,7 +184,18 @@ class CableMotion:
         offset = np.where(self.seen[..., None], predicted - self.points, 0.0)
         return np.einsum("tnij,tnj->tni", self.projectors, offset)
 
-    def rms(self, predicted: Array) -> float:
-        """Root mean square over points seen of that distance [m]."""
-        squares = (self.difference(predicted) ** 2).sum(axis=2)
-        return float(np.sqrt(squares.sum() / self.seen.sum()))
+    def mean_distance(self, predicted: Array) -> float:
+        """Over the points seen [m]; NaN where one of them was not predicted."""
+        return float(np.linalg.norm(self.difference(predicted), axis=2).sum() / self.seen.sum())
+
+
+def _filled(points: Array, seen: NDArray[np.bool_]) -> Array:
+    """Points (T, n, 3), those not seen from the same one before and after; zero if it never was."""
+    filled, samples = points.copy(), np.arange(len(points))
+    for point in range(points.shape[1]):
+        there = np.flatnonzero(seen[:, point])
+        for axis in range(3):
+            filled[:, point, axis] = (
+                np.interp(samples, there, points[there, point, axis]) if len(there) else 0.0
+            )
+    return filled

@@ -12,14 +12,23 @@ from dlo_gym.exceptions import DloError
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.properties import RodProperties
 from sim2real.identification.cable_motion import CableMotion
-from sim2real.identification.parameters import AT_REST, Parameter, prior, properties_of
+from sim2real.identification.parameters import (
+    N_DAMPING,
+    N_REST,
+    Parameter,
+    prior,
+    rod_of,
+    values_of,
+)
+from sim2real.identification.prediction import Model
 from sim2real.identification.residuals import Residuals
 
 LEARNT = 0.5  # posterior over prior deviation above which a motion told nothing of a parameter
 MEMORY = 1.0  # errors less apart than this are taken as correlated [s]
-ROUNDS = 3  # of estimating the errors' size and the parameters in turn
+ROUNDS = 2  # of estimating the errors' size and the parameters in turn
 FIRST_SCALE = 0.02  # taken for it at first [m]
 SMALLEST_SCALE = 1e-7  # [m]
+MOST_TRIALS = 50  # in each
 CONFIDENCE = 1.96  # deviations, 95 %
 
 
@@ -74,20 +83,21 @@ class Identified:
 def identify(
     motions: Sequence[CableMotion],
     *,
-    dynamic: bool = False,
+    model: Model = "motion",
     start: ArrayLike | None = None,
     callback: Callable[[float], None] | None = None,
 ) -> Identified:
     """The parameters of which a rod moves most like the cable did in all ``motions``.
 
     The posterior's mode: residuals count by a scale that is estimated with the parameters, such
-    that errors may be correlated at will along the cable and over a second (Newey and West 1987).
+    that errors may be correlated at will along the cable and over a second (Newey and West 1987);
+    what moves so unsteadily that it tells nothing hardly counts (``Residuals.weights``).
 
     Args:
         motions: of one cable.
-        dynamic: whether the rod has inertia; at rest in every sample otherwise.
+        model: of the motion; "motion" for a rod with inertia, see ``predict``.
         start: values to start from; if None the priors' medians, or for a rod with inertia what
-            is found at rest.
+            is found in equilibrium with the accelerations seen.
         callback: called with the RMS [m] of every trial.
 
     Raises:
@@ -96,42 +106,48 @@ def identify(
     """
     if not motions:
         raise ValueError("motions: expected at least one, got none")
-    parameters = prior(motions[0].length)[: 8 if dynamic else 6]
-    z = np.zeros(len(parameters))
+    parameters = prior(motions[0], model)
     if start is not None:
         values = np.asarray(start, dtype=np.float64)
         z = np.array([p.z(value) for p, value in zip(parameters, values, strict=True)])
-    elif dynamic:
-        z[: len(AT_REST)] = identify(motions, callback=callback).z
-    residuals = Residuals(motions, parameters, dynamic, callback)
+    elif model == "motion":
+        z = np.insert(
+            identify(motions, model="accelerated", callback=callback).z, N_REST, [0] * N_DAMPING
+        )
+    else:
+        z = np.zeros(len(parameters))
+    residuals = Residuals(motions, parameters, model, callback)
     if not np.isfinite(residuals.rms(z)):
         raise IdentificationFailed("no rod of plausible parameters could follow the motion")
-    scale = FIRST_SCALE
+    weights, scale = residuals.weights(z), FIRST_SCALE
     for _ in range(ROUNDS):
-        z = _mode(residuals, z, scale)
-        scale = _scale(residuals, z)
-    z = _mode(residuals, z, scale)
-    jacobian = residuals.jacobian(z)
-    information = jacobian.T @ jacobian / scale**2 + np.eye(len(z))
-    values = np.array([p.value(a) for p, a in zip(parameters, z, strict=True)])
+        z = _mode(residuals, z, weights / scale)
+        weights = residuals.weights(z)
+        scale = _scale(residuals, z, weights)
+    z = _mode(residuals, z, weights / scale)
+    jacobian = residuals.jacobian(z) * (weights / scale)[:, None]
+    information = jacobian.T @ jacobian + np.eye(len(z))
     return Identified(
-        parameters, z, np.linalg.inv(information), residuals.rms(z),
-        properties_of(values, motions[0]),
+        parameters, z, np.asarray(np.linalg.inv(information), dtype=np.float64), residuals.rms(z),
+        rod_of(values_of(parameters, z), motions[0], model),
     )  # fmt: skip
 
 
-def _mode(residuals: Residuals, z: Array, scale: float) -> Array:
-    jacobian: Any = lambda z: np.concatenate([residuals.jacobian(z) / scale, np.eye(len(z))])  # noqa: E731
+def _mode(residuals: Residuals, z: Array, weights: Array) -> Array:
+    """The best z from ``z`` on, with residuals times ``weights`` beside the prior's."""
+    jacobian: Any = lambda z: np.concatenate(  # noqa: E731
+        [residuals.jacobian(z) * weights[:, None], np.eye(len(z))]
+    )
     found = least_squares(
-        lambda z: np.concatenate([residuals.vector(z) / scale, z]), z, jacobian,
-        method="lm", xtol=1e-6, ftol=1e-8, max_nfev=100,
+        lambda z: np.concatenate([residuals.vector(z) * weights, z]), z, jacobian,
+        method="lm", xtol=1e-4, ftol=1e-5, max_nfev=MOST_TRIALS,
     )  # fmt: skip
     return found.x
 
 
-def _scale(residuals: Residuals, z: Array) -> float:
-    """Of the residuals [m] if they were independent and told as much as they do."""
-    jacobian, vector = residuals.jacobian(z), residuals.vector(z)
+def _scale(residuals: Residuals, z: Array, weights: Array) -> float:
+    """Of the weighted residuals [m] if they were independent and told as much as they do."""
+    jacobian, vector = residuals.jacobian(z) * weights[:, None], residuals.vector(z) * weights
     spread = np.zeros((len(z), len(z)))
     for rows, n_samples, per_sample, period in residuals.clips():
         scores = np.einsum(

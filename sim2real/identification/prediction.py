@@ -1,7 +1,10 @@
-"""Where a rod would have been: through the clamps' recorded poses, at rest in each or in motion."""
+"""Where a rod would have been: its clamps go through the recorded poses, and it rests or moves.
+
+Derivatives are by ``COLUMNS``: the rod's parameters, then a turn of either clamp in its own axes.
+"""
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -9,6 +12,7 @@ from dlo_gym.exceptions import RodDiverged
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.properties import RodProperties
 from dlo_gym.rod.rod import CosseratRod
+from dlo_gym.rod.sensitivity import PARAMETERS, MotionSensitivity
 from dlo_gym.rod.state import RodState
 from sim2real.identification.cable_motion import CableMotion
 
@@ -17,43 +21,68 @@ LARGEST_STEP = 0.025  # in time [s]
 HOLD = 100.0  # springs to the first sample, in weights of the cable per length
 LAUNCH = 0.02  # over which its velocity is taken [s]
 
+ROD = (
+    "log_EI", "log_GJ", "rest_curvature_1", "rest_curvature_2", "rest_twist", "length",
+    "external_damping", "internal_damping",
+)  # fmt: skip
+TURNS = tuple(f"{side}_turn_{axis}" for side in ("left", "right") for axis in (1, 2, 3))
+COLUMNS = (*ROD, *TURNS)
+
+Model = Literal["rest", "accelerated", "motion"]
+
 
 class Prediction(NamedTuple):
-    """Points of a rod and how they change with what it is made of.
+    """Points of a rod and how they change.
 
     Attributes:
         points: (T, n_points, 3) [m], NaN where the rod could not follow.
-        by_parameters: (T, n_points, 3, 7) their derivatives by ``rod.sensitivity.PARAMETERS``.
+        by: (T, n_points, 3, 14) their derivatives by ``COLUMNS``; zero where it could not.
     """
 
     points: Array
-    by_parameters: Array
+    by: Array
 
 
-def at_rest(motion: CableMotion, properties: RodProperties) -> Prediction:
+def predict(motion: CableMotion, properties: RodProperties, model: Model) -> Prediction:
+    """The rod in equilibrium in every sample ("rest"), in equilibrium with the accelerations seen
+    ("accelerated"), or started as the cable did and then moved by its clamps alone ("motion")."""
+    if model == "motion":
+        return in_motion(motion, properties)
+    return at_rest(motion, properties, accelerated=model == "accelerated")
+
+
+def at_rest(
+    motion: CableMotion, properties: RodProperties, *, accelerated: bool = False
+) -> Prediction:
     """The equilibrium in every sample, each followed from the one before.
 
     The first starts from the curve that was seen, and so does one that cannot be followed.
     """
     rod = CosseratRod(properties, motion.n_elements, clamp=motion.clamp)
-    points = np.full(motion.points.shape, np.nan)
-    by_parameters = np.zeros((*points.shape, 7))
-    settled = False
+    mass = np.full((rod.n_nodes, 1), motion.mass_per_length * properties.length / rod.n_elements)
+    mass[[0, -1]] *= 0.5
+    prediction = _nothing(motion)
+    rests = False
     for sample in range(len(motion)):
-        settled = _rest(rod, motion, sample, settled)
-        if settled:
-            points[sample] = motion.weights @ rod.state.positions
-            by_parameters[sample] = np.einsum(
-                "pn,nij->pij", motion.weights, rod.parameter_sensitivity()
-            )
-    return Prediction(points, by_parameters)
+        if accelerated:
+            rod.apply_forces(-mass * motion.accelerations[sample])
+        rests = _rest(rod, motion, sample, rests)
+        if rests:
+            prediction.points[sample] = motion.weights @ rod.state.positions
+            prediction.by[sample] = np.tensordot(motion.weights, _by_columns(rod), 1)
+    return prediction
 
 
-def _rest(rod: CosseratRod, motion: CableMotion, sample: int, settled: bool) -> bool:
+def _nothing(motion: CableMotion) -> Prediction:
+    shape = motion.points.shape
+    return Prediction(np.full(shape, np.nan), np.zeros((*shape, len(COLUMNS))))
+
+
+def _rest(rod: CosseratRod, motion: CableMotion, sample: int, rests: bool) -> bool:
     """Brings ``rod`` to rest in a sample's clamps; whether that worked."""
     boundary = motion.boundary(sample)
     try:
-        if settled:
+        if rests:
             rod.move(rod.state.boundary.displacement_to(boundary))
             return True
     except (RodDiverged, ValueError):
@@ -65,33 +94,47 @@ def _rest(rod: CosseratRod, motion: CableMotion, sample: int, settled: bool) -> 
     return True
 
 
-def in_motion(motion: CableMotion, properties: RodProperties) -> Array:
-    """Points (T, n_points, 3) [m] of a rod that starts as the cable did and then is moved by its
-    clamps alone; NaN from where it could not follow."""
+def _by_columns(rod: CosseratRod) -> Array:
+    """(n_nodes, 3, 14) derivatives of an equilibrium."""
+    by = np.zeros((rod.n_nodes, 3, len(COLUMNS)))
+    wanted = [name for name in ROD if name in PARAMETERS]
+    by[..., : len(wanted)] = rod.parameter_sensitivity()[..., [PARAMETERS.index(n) for n in wanted]]
+    by_clamps = rod.sensitivity()
+    for side, clamp in enumerate(rod.state.boundary.clamps):
+        turns = by_clamps[..., 6 * side + 3 : 6 * side + 6] @ clamp[:3, :3]
+        by[..., len(ROD) + 3 * side : len(ROD) + 3 * side + 3] = turns
+    return by
+
+
+def in_motion(motion: CableMotion, properties: RodProperties) -> Prediction:
+    """A rod that starts as the cable did; derivatives are carried along exactly."""
     rod = CosseratRod(properties, motion.n_elements, clamp=motion.clamp)
-    points = np.full(motion.points.shape, np.nan)
+    prediction = _nothing(motion)
     try:
-        state = first_state(rod, motion)
-        points[0] = motion.weights @ state.positions
-        for sample in range(1, len(motion)):
-            state = rod.advance(
-                state.boundary.displacement_to(motion.boundary(sample)),
-                float(motion.stamps[sample] - motion.stamps[sample - 1]),
-                dt=LARGEST_STEP,
-            )
-            points[sample] = motion.weights @ state.positions
+        state, sensitivity = start(rod, motion)
+        for sample in range(len(motion)):
+            if sample:
+                state, sensitivity = rod.advance_with_sensitivity(
+                    sensitivity,
+                    state.boundary.displacement_to(motion.boundary(sample)),
+                    float(motion.stamps[sample] - motion.stamps[sample - 1]),
+                    dt=LARGEST_STEP,
+                )
+            prediction.points[sample] = motion.weights @ state.positions
+            prediction.by[sample] = np.tensordot(motion.weights, sensitivity.positions, 1)
     except (RodDiverged, ValueError):  # ValueError: a rod shorter than the clamps' distance
         pass
-    return points
+    return prediction
 
 
-def first_state(rod: CosseratRod, motion: CableMotion) -> RodState:
+def start(rod: CosseratRod, motion: CableMotion) -> tuple[RodState, MotionSensitivity]:
     """Brings ``rod`` to the first sample: springs hold it to the curve that was seen, whose change
-    over ``LAUNCH`` gives the velocities. A cable that stood is at rest."""
-    curve, start = motion.curve(0), motion.boundary(0)
-    weight = float(np.mean(rod.properties.linear_density)) * GRAVITY * rod.properties.length
+    over ``LAUNCH`` gives the velocities."""
+    curve = motion.curve(0)
+    weight = motion.mass_per_length * GRAVITY * rod.properties.length
     rod.attract(curve, HOLD * weight / rod.properties.length)
-    state = rod.settle(start, curve)
+    state = rod.settle(motion.boundary(0), curve)
+    held = rod.motion_sensitivity(ROD, by_clamps=True)
     rod.attract(curve, 0.0)
     later = max(1, int(np.searchsorted(motion.stamps - motion.stamps[0], LAUNCH)))
     duration = float(motion.stamps[later] - motion.stamps[0])
@@ -101,4 +144,17 @@ def first_state(rod: CosseratRod, motion: CableMotion) -> RodState:
     turning /= (along**2).sum(axis=1, keepdims=True)
     spins = np.einsum("nji,nj->ni", state.directors, turning)
     rod.restore(replace(state, velocities=velocities, angular_velocities=spins))
-    return rod.state
+    return rod.state, _with_turns(held, motion.boundary(0).clamps)
+
+
+def _with_turns(held: MotionSensitivity, clamps: Array) -> MotionSensitivity:
+    """With columns for turns of the clamps in their own axes, which stay the same as they move, in
+    place of those for twists in the world's."""
+    sensitivity = MotionSensitivity.zero(COLUMNS, len(held.turns))
+    for name in ("positions", "turns", "clamps"):
+        values, former = getattr(sensitivity, name), getattr(held, name)
+        values[..., : len(ROD)] = former[..., : len(ROD)]
+        for side, clamp in enumerate(clamps):
+            columns, twists = len(ROD) + 3 * side, len(ROD) + 6 * side + 3
+            values[..., columns : columns + 3] = former[..., twists : twists + 3] @ clamp[:3, :3]
+    return sensitivity

@@ -7,12 +7,11 @@ import numpy as np
 
 from dlo_gym.geometry.se3 import Array
 from sim2real.identification.cable_motion import CableMotion
-from sim2real.identification.parameters import Parameter, properties_of
-from sim2real.identification.prediction import at_rest, in_motion
+from sim2real.identification.parameters import Grip, Parameter, grips_of, rod_of, values_of
+from sim2real.identification.prediction import ROD, Model, Prediction, predict
 
 LOST = 0.3  # distance counted where the rod could not follow [m]
-STEP = 3e-3  # of differences, in prior deviations
-EI, GJ, REST, LENGTH = 0, 1, slice(3, 6), 6  # columns of rod.sensitivity.PARAMETERS
+STEADY = 0.3  # [m per prior deviation]
 
 
 class Clip(NamedTuple):
@@ -30,8 +29,8 @@ class Residuals:
 
     Args:
         motions: of one cable.
-        parameters: those of ``AT_REST`` or ``IN_MOTION``.
-        dynamic: whether the rod has inertia.
+        parameters: of the ``prior`` of the model.
+        model: of the motion.
         callback: called with the RMS [m] of every trial.
     """
 
@@ -39,16 +38,15 @@ class Residuals:
         self,
         motions: Sequence[CableMotion],
         parameters: Sequence[Parameter],
-        dynamic: bool,
+        model: Model,
         callback: Callable[[float], None] | None = None,
     ) -> None:
         self._motions = motions
         self._parameters = parameters
-        self._dynamic = dynamic
+        self._model: Model = model
         self._callback = callback
         self._z = np.full(len(parameters), np.nan)
-        self._points: list[Array] = []
-        self._jacobian: Array | None = None
+        self._predictions: list[Prediction] = []
 
     def clips(self) -> Iterator[Clip]:
         first = 0
@@ -60,73 +58,67 @@ class Residuals:
 
     def vector(self, z: Array) -> Array:
         """(n_rows,) [m]."""
-        self._predict(z)
-        return self._of(self._points)
-
-    def jacobian(self, z: Array) -> Array:
-        """(n_rows, n_parameters) [m per prior deviation]."""
-        self._predict(z)
-        if self._jacobian is None:
-            here = self._of(self._points)
-            self._jacobian = np.column_stack(
-                [
-                    (self._of(self._in_motion(z + step)) - here) / STEP
-                    for step in STEP * np.eye(len(z))
-                ]
-            )
-        return self._jacobian
-
-    def rms(self, z: Array) -> float:
-        """Over all points seen [m]; NaN where the rod could not follow one."""
-        self._predict(z)
-        squares, count = 0.0, 0
-        for motion, points in zip(self._motions, self._points, strict=True):
-            squares += float((motion.difference(points) ** 2).sum())
-            count += int(motion.seen.sum())
-        return float(np.sqrt(squares / count))
-
-    def _of(self, predicted: Sequence[Array]) -> Array:
         parts = []
-        for motion, points in zip(self._motions, predicted, strict=True):
+        for motion, (points, _) in self.predicted(z):
             there = np.where(np.isfinite(points), points, motion.points + LOST)
             parts.append(motion.difference(there).ravel())
         return np.concatenate(parts)
 
-    def _values(self, z: Array) -> Array:
-        return np.array([p.value(a) for p, a in zip(self._parameters, z, strict=True)])
+    def jacobian(self, z: Array) -> Array:
+        """(n_rows, n_parameters) [m per prior deviation]."""
+        values = values_of(self._parameters, z)
+        slopes = [p.slope(v) for p, v in zip(self._parameters, values, strict=True)]
+        return np.concatenate([
+            np.einsum(
+                "tnij,tnjp->tnip",
+                motion.projectors,
+                _by_values(by, values, grips_of(values, motion, self._model), self._model) * slopes,
+            ).reshape(-1, len(values))
+            for motion, (_, by) in self.predicted(z)
+        ])  # fmt: skip
 
-    def _predict(self, z: Array) -> None:
-        if np.array_equal(z, self._z):
-            return
-        self._z, self._jacobian = np.array(z), None
-        if self._dynamic:
-            self._points = self._in_motion(z)
-        else:
-            values = self._values(z)
-            predictions = [at_rest(m, properties_of(values, m)) for m in self._motions]
-            self._points = [prediction.points for prediction in predictions]
-            self._jacobian = np.concatenate([
-                self._by_z(values, motion, prediction.by_parameters)
-                for motion, prediction in zip(self._motions, predictions, strict=True)
-            ])  # fmt: skip
-        if self._callback is not None:
-            self._callback(self.rms(z))
+    def weights(self, z: Array) -> Array:
+        """(n_rows,) of the residuals: 1 where the rod moves steadily, less where it answers a prior
+        deviation by more than ``STEADY``. A snap or a whip enlarges the errors of the first sample,
+        which nobody knows, as it does those of the parameters."""
+        answer = np.linalg.norm(self.jacobian(z), axis=1)
+        return 1.0 / np.hypot(1.0, answer / STEADY)
 
-    def _in_motion(self, z: Array) -> list[Array]:
-        values = self._values(z)
-        return [in_motion(motion, properties_of(values, motion)) for motion in self._motions]
+    def rms(self, z: Array) -> float:
+        """Over all points seen [m]; NaN where the rod could not follow one."""
+        squares, count = 0.0, 0
+        for motion, (points, _) in self.predicted(z):
+            squares += float((motion.difference(points) ** 2).sum())
+            count += int(motion.seen.sum())
+        return float(np.sqrt(squares / count))
 
-    def _by_z(self, values: Array, motion: CableMotion, by_rod: Array) -> Array:
-        """Chain rule from the rod's parameters to z; that stretch follows EI is neglected."""
-        columns = np.concatenate(
-            [
-                by_rod[..., [EI]] + by_rod[..., [GJ]],
-                by_rod[..., [GJ]],
-                by_rod[..., REST],
-                by_rod[..., [LENGTH]] * values[5],
-            ],
-            axis=-1,
-        )
-        spreads = [np.log(p.spread) if p.positive else p.spread for p in self._parameters]
-        jacobian = np.einsum("tnij,tnjp->tnip", motion.projectors, columns * spreads)
-        return jacobian.reshape(-1, len(values))
+    def predicted(self, z: Array) -> list[tuple[CableMotion, Prediction]]:
+        """Every motion with its prediction."""
+        if not np.array_equal(z, self._z):
+            values = values_of(self._parameters, z)
+            self._predictions = [
+                predict(
+                    motion.held([g.rotation for g in grips_of(values, motion, self._model)]),
+                    rod_of(values, motion, self._model),
+                    self._model,
+                )
+                for motion in self._motions
+            ]
+            self._z = np.array(z)
+            if self._callback is not None:
+                self._callback(self.rms(z))
+        return list(zip(self._motions, self._predictions, strict=True))
+
+
+def _by_values(by: Array, values: Array, grips: Sequence[Grip], model: Model) -> Array:
+    """Derivatives (..., 14) by ``prediction.COLUMNS`` as those by the parameters' values.
+
+    That stretch follows EI is neglected.
+    """
+    EI, GJ = by[..., [0]], by[..., [1]]
+    rod = by[..., 2 : len(ROD) if model == "motion" else len(ROD) - 2]
+    turns = [
+        by[..., len(ROD) + 3 * side : len(ROD) + 3 * side + 3] @ grip.axes
+        for side, grip in enumerate(grips)
+    ]
+    return np.concatenate([(EI + GJ) / values[0], GJ / values[1], rod, *turns], axis=-1)
