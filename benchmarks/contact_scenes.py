@@ -165,13 +165,16 @@ def main() -> None:
     rod = loose_knot()
     for way in into_line(rod):
         rod.move(way)
-    for column, distance in enumerate((0.31, 0.385)):
+    for column, distance in enumerate((0.31, 0.45)):
         while rod.state.boundary.distance < distance:
             rod.move(pulled_apart(0.005))
         axes = figure.add_subplot(
             1, 3, 2 + column, projection="3d", title=("a knot", "pulled tight")[column]
         )
-        show(axes, [(finer(rod.state.positions), STRING.radius, "tab:blue")], (75.0, -85.0))
+        string = rod.state.positions
+        near = string[np.linalg.norm(string, axis=1) < (0.16, 0.07)[column]]
+        view = ((75.0, -85.0), (20.0, -85.0))[column]
+        show(axes, [(finer(near), STRING.radius, "tab:blue")], view)
     PICTURE.parent.mkdir(parents=True, exist_ok=True)
     with written_aside(PICTURE, DloError) as part:
         figure.savefig(part, format="png", dpi=100, metadata={"Software": None})

@@ -225,7 +225,7 @@ def test_divergence_carries_the_last_good_state(call, monkeypatch):
         "advance": lambda: lost.advance(shift, 0.1),
         "set_obstacles": lambda: lost.set_obstacles([Plane()]),
     }
-    monkeypatch.setattr("dlo_gym.rod.rod.LARGEST_BEND", 1e-9)
+    monkeypatch.setattr(lost, "_bounds", lost._bounds._replace(bend=1e-9))
     with pytest.raises(RodDiverged) as caught:
         calls[call]()
     for state in (caught.value.last_good, lost.state):
@@ -235,7 +235,7 @@ def test_divergence_carries_the_last_good_state(call, monkeypatch):
 
 def test_the_first_settling_has_no_last_good_state(monkeypatch):
     lost = rod()
-    monkeypatch.setattr("dlo_gym.rod.rod.LARGEST_BEND", 1e-9)
+    monkeypatch.setattr(lost, "_bounds", lost._bounds._replace(bend=1e-9))
     with pytest.raises(RodDiverged) as caught:
         lost.settle(HELD)
     assert caught.value.last_good is None

@@ -75,6 +75,6 @@ def test_knot_is_pulled_tight_without_passing_through_itself():
         assert state.contact is not None
         pressed.append(np.linalg.norm(state.contact.self_forces, axis=1).sum())
     print(f"pulled to {tightest:.3f} of the length, strands press with {pressed[-1]:.2f} N")
-    assert tightest > 0.65
+    assert tightest > 0.7
     assert pressed[-1] > 2.0 * pressed[0]
     assert writhe == pytest.approx(-3.1, abs=0.15)  # of a trefoil: three crossings
