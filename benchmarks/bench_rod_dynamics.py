@@ -1,8 +1,9 @@
-"""One 5 cm action at 0.2 m/s in motion: time and error of this rod and of PyElastica.
+"""One 5 cm action at 0.2 m/s in motion: time and error of this rod, of PyElastica and of MuJoCo.
 
 Errors are node distances at the action's end to a fine solution (160 elements, 1 ms) that starts
 from its own equilibrium between the same clamps, so that they hold the error in space, of the
-clamps' model, and in time. PyElastica runs 50 elements with boundary conditions in numba.
+clamps' model, and in time. PyElastica runs 50 elements with boundary conditions in numba,
+MuJoCo's flex rod 50 with its end edges held by mocap bodies.
 """
 
 import time
@@ -14,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.bench_rod import bytes_of
+from benchmarks.mujoco_flex_peer import MujocoFlexRod
 from benchmarks.pyelastica_peer import PyElasticaRod
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod import BoundaryDisplacement, BoundaryPoses, CosseratRod, RodProperties
@@ -70,6 +72,16 @@ def timed_peer(action: Action) -> tuple[Array, float]:
     return peer.positions, time.perf_counter() - began
 
 
+def timed_flex(action: Action, time_step: float) -> tuple[Array, float]:
+    start = CosseratRod(PROPERTIES).settle(action.boundary)
+    peer = MujocoFlexRod(
+        PROPERTIES, start, action.displacement, duration=DURATION, time_step=time_step
+    )
+    began = time.perf_counter()
+    peer.advance(DURATION)
+    return peer.positions, time.perf_counter() - began
+
+
 def main() -> None:
     rng = np.random.default_rng(0)
     actions = [random_action(rng) for _ in range(ACTIONS + 1)]
@@ -80,9 +92,12 @@ def main() -> None:
         fine.settle(action.boundary)
         exact.append(at_nodes(fine.advance(action.displacement, DURATION, dt=1e-3).positions))
         runs.setdefault("PyElastica 1.0.0, n 50, 0.1 ms", []).append(timed_peer(action))
+        for dt in (0.005, 0.01, 0.02, 0.03125):
+            name = f"MuJoCo flex, n 50, {1e3 * dt:g} ms"
+            runs.setdefault(name, []).append(timed_flex(action, dt))
         for n in (16, 25, 50):
             rod = CosseratRod(PROPERTIES, n, clamp="node")
-            for dt in (0.005, 0.0125, 0.025, 0.0625):
+            for dt in (0.005, 0.0125, 0.025, 0.0625, 0.25):
                 name = f"advance, n {n}, {1e3 * dt:g} ms"
                 runs.setdefault(name, []).append(timed_advance(rod, action, dt))
     table = Table("5 cm in 0.25 s", "ms", "mean error mm", "max error mm", "PyElastica / ours")

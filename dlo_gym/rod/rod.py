@@ -647,12 +647,9 @@ class CosseratRod:
 
     def _wrenches(self) -> Array:
         """(2, 6) force and torque of the clamps on the rod, world axes."""
-        wrenches = np.zeros((2, 6))
-        wrenches[0, :3] = self._work.gradient[:3]
-        wrenches[0, 3:] = self._rotations[0] @ self._work.clamp_terms[0, 0]
-        if self._ends.right_held:
-            wrenches[1, :3] = self._work.gradient[-3:]
-            wrenches[1, 3:] = self._rotations[1] @ self._work.clamp_terms[1, 0]
+        wrenches = np.empty((2, 6))
+        held = self._ends.right_held
+        move_kernels.clamp_wrenches(self._work, self._clamps, held, wrenches.reshape(12))
         return wrenches
 
     def _damping_wrenches(self) -> Array:
