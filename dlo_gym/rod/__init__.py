@@ -4,6 +4,7 @@ from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.obstacles import Box, Capsule, Plane, Sphere
 from dlo_gym.rod.properties import RodProperties
 from dlo_gym.rod.rod import CosseratRod
+from dlo_gym.rod.sensitivity import MotionSensitivity
 from dlo_gym.rod.state import RodContact, RodState, ShapeEstimate
 
 __all__ = [
@@ -12,6 +13,7 @@ __all__ = [
     "Box",
     "Capsule",
     "CosseratRod",
+    "MotionSensitivity",
     "Plane",
     "RodContact",
     "RodProperties",

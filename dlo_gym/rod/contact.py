@@ -216,6 +216,21 @@ class ContactModel:
         """Update ``columns`` (n_dofs, 12) with d(unknowns)/d(clamp twists)."""
         kernels.sensitivity(work, self.matrix, self.remote, rotations, right_held, columns)
 
+    def lengthen(self, positions: Array, length: float, gradient: Array) -> None:
+        """Add to ``gradient`` (n_dofs,) its derivative by the rod's ``length`` [m], on which the
+        stiffness of each contact point with obstacles depends."""
+        change = np.zeros(len(gradient))
+        point_kernels.add_obstacles(
+            self.constants, self.arrays, Hold(self.anchors, NO_LAG, False), positions, change,
+            np.zeros_like(self.matrix),
+        )  # fmt: skip
+        gradient += change / length
+
+    def solve(self, first: int, last: int, columns: Array) -> None:
+        """Update ``columns`` (n_dofs, m), zero but for rows ``first`` to ``last``, to their product
+        with the inverse of the tangent last factorised."""
+        pair_kernels.solve(self.matrix, self.remote, first, last, columns)
+
     def _within_rounding(self, system: System, limits: Limits) -> Limits:
         """Limits that coordinates of about 1 m can meet, given the stiffness of their springs."""
         springs = self._stiffness + system.inertia.weight.max(initial=0.0)

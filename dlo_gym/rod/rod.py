@@ -15,6 +15,7 @@ from dlo_gym.rod import _kernels_solve as kernels
 from dlo_gym.rod import contact_dynamics
 from dlo_gym.rod._kernels_assembly import System
 from dlo_gym.rod._kernels_clamps import clamp_frame
+from dlo_gym.rod._kernels_dynamics import Plan
 from dlo_gym.rod._kernels_inertia import NO_INERTIA, Inertia
 from dlo_gym.rod._kernels_moment import hidden_energy
 from dlo_gym.rod._kernels_rates import kinetic_energy
@@ -28,10 +29,12 @@ from dlo_gym.rod.obstacles import Obstacle, check_obstacles, on_the_way
 from dlo_gym.rod.properties import RodProperties, per_element
 from dlo_gym.rod.sensitivity import (
     MOTION_PARAMETERS,
+    PARAMETERS,
     MotionSensitivity,
     at_rest,
     carried_of,
     check_parameters,
+    parameter_gradient,
     parameter_sensitivity,
     sensitivity_of,
     with_clamps,
@@ -305,7 +308,15 @@ class CosseratRod:
                 further apart than the rod is long or inside an obstacle.
             RodDiverged: if no step was small enough; the rod keeps its state before.
         """
-        return self._advance(displacement, duration, dt, order, tolerance, obstacles)
+        self._settled("advance")
+        touching = self._contact.possible
+        if touching and (order == 2 or tolerance is not None):
+            raise ValueError(
+                "order, tolerance: expected order 1 and no tolerance for a rod that can touch"
+                f" something, got {order} and {tolerance}"
+            )
+        plan = plan_of(duration, dt, order or (1 if touching else 2), tolerance)
+        return self._advance(displacement, plan, obstacles)
 
     def advance_with_sensitivity(
         self,
@@ -340,18 +351,16 @@ class CosseratRod:
                 f"sensitivity: expected that of {self.n_elements} elements,"
                 f" got {len(sensitivity.turns)}"
             )
-        by_before = len(sensitivity.columns)
-        if by_displacement:
-            sensitivity = with_displacement(sensitivity, 1 + self._ends.right_held)
-        velocity = np.zeros((12, len(sensitivity.columns)))
-        extra = velocity[:, by_before:]
-        np.fill_diagonal(extra, 1.0 / duration)
+        plan = plan_of(duration, dt, order, tolerance)
+        n_clamps = (1 + self._ends.right_held) if by_displacement else 0
+        sensitivity = with_displacement(sensitivity, n_clamps)
         carried = carried_of(
-            sensitivity, self._rotations, self.properties.internal_damping,
-            node_weights(self.properties, self.n_elements, self.gravity), velocity,
+            sensitivity, 6 * n_clamps, plan.duration, self._rotations,
+            self.properties.internal_damping,
+            node_weights(self.properties, self.n_elements, self.gravity),
         )  # fmt: skip
-        state = self._advance(displacement, duration, dt, order, tolerance, None, carried)
-        after = sensitivity_of(sensitivity.columns, carried, self._rotations, duration)
+        state = self._advance(displacement, plan, None, carried)
+        after = sensitivity_of(sensitivity.columns, carried, self._rotations, plan.duration)
         return state, after
 
     def motion_sensitivity(
@@ -397,32 +406,26 @@ class CosseratRod:
     def _by_parameters(self) -> Array:
         """(n_dofs, 7) of the unknowns by PARAMETERS, at an equilibrium."""
         weight = node_weights(self.properties, self.n_elements, self.gravity)
-        return parameter_sensitivity(self._arrays, weight, self._x, self._q, self._ends, self._work)
+        gradients = parameter_gradient(self._arrays, weight, self._x, self._q, self._ends)
+        if self._contact.possible:
+            by_length = gradients[:, PARAMETERS.index("length")]
+            self._contact.lengthen(self._x, self.properties.length, by_length)
+        return parameter_sensitivity(gradients, self._ends, self._work, self._contact)
 
     def _advance(
         self,
         displacement: BoundaryDisplacement,
-        duration: float,
-        dt: float,
-        order: Literal[1, 2] | None,
-        tolerance: float | None,
+        plan: Plan,
         obstacles: Sequence[Obstacle] | None,
         carried: Carried | None = None,
     ) -> RodState:
         before = self._settled("advance")
-        touching = self._contact.possible
-        if touching and (order == 2 or tolerance is not None):
-            raise ValueError(
-                "order, tolerance: expected order 1 and no tolerance for a rod that can touch"
-                f" something, got {order} and {tolerance}"
-            )
-        plan = plan_of(duration, dt, order or (1 if touching else 2), tolerance)
         target = before.displaced(displacement)
         moved = None if obstacles is None else self._contact.check_same(obstacles)
         self._check_boundary(target, self._contact.obstacles if moved is None else moved)
         saved = self.state
-        path = clamp_path(before, displacement, duration)
-        if touching:
+        path = clamp_path(before, displacement, plan.duration)
+        if self._contact.possible:
             status, reached = contact_dynamics.advance(
                 self._contact, moved, self._system, self._motion, path, self._ends,
                 (self._x, self._q, self._v, self._w, self._creep), plan, self._limits, self._work,
@@ -438,11 +441,11 @@ class CosseratRod:
         if problem:
             self.restore(saved)
             raise RodDiverged(
-                f"the motion was lost {reached:.4g} s into an advance of {duration:.4g} s:"
+                f"the motion was lost {reached:.4g} s into an advance of {plan.duration:.4g} s:"
                 f" {problem}",
                 last_good=saved,
             )
-        self._time += duration
+        self._time += plan.duration
         self._set_clamps(target)
         kernels.exact_stress(self._arrays, self._x, self._q, self._work.stress)
         self._linearise()
@@ -516,14 +519,13 @@ class CosseratRod:
 
         Columns follow ``sensitivity.PARAMETERS``: log EI, log GJ, log of the weight, the three
         components of a uniform rest curvature [1/m], and the length [m]. A rod that yields keeps
-        the plastic curvature it had before its last solve.
+        the plastic curvature it had before its last solve, and friction holds it where it does.
+        With contact the derivatives are those while the same points touch.
 
         Raises:
-            ValueError: if the rod has not settled, or can touch something.
+            ValueError: if the rod has not settled.
         """
         self._settled("parameter_sensitivity")
-        if self._contact.possible:
-            raise ValueError("parameter_sensitivity: expected a rod that can touch nothing")
         return self._of_nodes(self._by_parameters())
 
     def _of_nodes(self, columns: Array) -> Array:

@@ -12,6 +12,7 @@ from dlo_gym.rod._kernels_parameters import explicit_gradient
 from dlo_gym.rod._kernels_sensitivity import Carried, empty_carried
 from dlo_gym.rod._kernels_solve import free_range
 from dlo_gym.rod._kernels_tangent import empty_geometry, measure
+from dlo_gym.rod.contact import ContactModel
 
 PARAMETERS = (
     "log_EI",
@@ -112,22 +113,29 @@ def check_parameters(parameters: Sequence[str]) -> tuple[str, ...]:
     return tuple(parameters)
 
 
-def parameter_sensitivity(
-    rod: RodArrays, weight: Array, x: Array, q: Array, ends: Ends, work: Work
-) -> Array:
-    """d(unknowns)/d(PARAMETERS), shape (n_dofs, 7), given the factors of H in ``work``.
+def parameter_gradient(rod: RodArrays, weight: Array, x: Array, q: Array, ends: Ends) -> Array:
+    """d(gradient)/d(PARAMETERS), shape (n_dofs, 7), at the shape x, q, without contact.
 
-    H d(unknowns) = -d(gradient)/d(parameter); ``weight`` (n + 1, 3) [N] is of the nodes.
+    ``weight`` (n + 1, 3) [N] is of the nodes.
     """
     n = len(q)
     columns, geometry = np.empty((6 * n + 3, len(PARAMETERS))), empty_geometry(n)
     measure(rod, x, q, ends, geometry)
     explicit_gradient(rod, geometry, np.arange(len(PARAMETERS)), ends.right_held, weight, columns)
-    first, last = free_range(n, ends.right_held)
-    columns *= -1.0
+    return columns
+
+
+def parameter_sensitivity(gradients: Array, ends: Ends, work: Work, contact: ContactModel) -> Array:
+    """d(unknowns)/d(PARAMETERS), shape (n_dofs, 7), given the last solve's factors of H:
+    H d(unknowns) = -d(gradient)/d(parameters)."""
+    first, last = free_range((len(gradients) - 3) // 6, ends.right_held)
+    columns = -gradients
     columns[:first] = 0.0
     columns[last:] = 0.0
-    solve(work.band, first, last, columns)
+    if contact.possible:
+        contact.solve(first, last, columns)
+    else:
+        solve(work.band, first, last, columns)
     return columns
 
 
@@ -171,19 +179,21 @@ def with_clamps(sensitivity: MotionSensitivity, unknowns: Array) -> MotionSensit
 
 def carried_of(
     sensitivity: MotionSensitivity,
+    moving: int,
+    duration: float,
     rotations: Array,
     internal_damping: float,
     weight: Array,
-    velocity: Array,
 ) -> Carried:
     """What the kernels carry from ``sensitivity``.
 
     Args:
         sensitivity: of the rod's present state.
+        moving: how many of its last columns are of the clamps' displacement.
+        duration: in which they are displaced [s].
         rotations: (2, 3, 3) R_world_clamp.
         internal_damping: of the rod [s].
         weight: (n + 1, 3) of the nodes [N].
-        velocity: (12, m) of the clamps in world axes, by every column [m/s, rad/s].
     """
     names, n = sensitivity.columns, len(sensitivity.turns)
     codes = np.array(
@@ -195,7 +205,8 @@ def carried_of(
     poses = sensitivity.clamps.reshape(2, 2, 3, -1)
     carried.positions[:] = poses[:, 0]
     carried.turns[:] = rotations.transpose(0, 2, 1) @ poses[:, 1]
-    carried.velocity[:] = velocity
+    for k in range(moving):
+        carried.velocity[k, len(names) - moving + k] = 1.0 / duration
     unknowns = carried.now.unknowns
     unknowns[:-3].reshape(n, 6, -1)[:, :3] = sensitivity.positions[:-1]
     unknowns[-3:] = sensitivity.positions[-1]
