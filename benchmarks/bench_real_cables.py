@@ -44,7 +44,7 @@ def predictions(motion: CableMotion, found: Identified) -> list[Array]:
     grips = grips_of(values_of(found.parameters, found.z), motion, "motion")
     held = motion.held([grip.rotation for grip in grips])
     return [
-        predict(held, found.properties, "motion").points,
+        predict(held, found.properties, "motion", derivatives=False).points,
         predict(held, found.properties, "rest").points,
         blend(motion),
     ]
@@ -92,9 +92,10 @@ def measure(cable: str, table: Table, console: Console) -> None:
                 if kind == "unseen" and index == 0:
                     draw(motion, points, f"{cable}, unseen")
             console.print(f"{cable}, {kind}, mm per clip:\n{np.round(errors, 1)}")
-            lost = int(np.isnan(np.array(errors)[:, 0]).sum())
-            means = [f"{mean:.1f}" for mean in np.nanmean(errors, axis=0)]
-            medians = [f"{median:.1f}" for median in np.nanmedian(errors, axis=0)]
+            followed = np.array(errors)[np.isfinite(errors).all(axis=1)]
+            lost = len(errors) - len(followed)
+            means = [f"{mean:.1f}" for mean in followed.mean(axis=0)]
+            medians = [f"{median:.1f}" for median in np.median(followed, axis=0)]
             both = [f"{a} ({b})" for a, b in zip(means, medians, strict=True)]
             table.add_row(f"{cable}, {len(motions)} {kind}", *both, f"{lost}")
 
@@ -105,7 +106,7 @@ def main(cables: tuple[str, ...] = deform_mocap.CABLES) -> None:
         console.print(f"no clips at {deform_mocap.FOLDER}; set DLO_DATA to identify real cables")
         return
     table = Table("cable, clips", *(f"{method} mm" for method in METHODS), "lost",
-                  title="mean distance over 5 s (median of the clips)")  # fmt: skip
+                  title="mean distance over 5 s (median), of the clips not lost")  # fmt: skip
     for cable in cables:
         measure(cable, table, console)
     console.print(table)

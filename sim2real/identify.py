@@ -184,7 +184,7 @@ def summary(found: Identified, title: str) -> Table:
 def draw(file: Path, motion: CableMotion, found: Identified, model: Model) -> None:
     """Shapes seen and fitted, from the side and from above, and the distance over time."""
     matplotlib.use("Agg")
-    points = predict(motion, found.properties, model).points
+    points = predict(motion, found.properties, model, derivatives=False).points
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     side, top, error = figure.subplots(1, 3)
     samples = np.unique(np.linspace(0, len(motion) - 1, N_SHAPES).round().astype(int))

@@ -43,11 +43,16 @@ class Prediction(NamedTuple):
     by: Array
 
 
-def predict(motion: CableMotion, properties: RodProperties, model: Model) -> Prediction:
+def predict(
+    motion: CableMotion, properties: RodProperties, model: Model, *, derivatives: bool = True
+) -> Prediction:
     """The rod in equilibrium in every sample ("rest"), in equilibrium with the accelerations seen
-    ("accelerated"), or started as the cable did and then moved by its clamps alone ("motion")."""
+    ("accelerated"), or started as the cable did and then moved by its clamps alone ("motion").
+
+    In motion ``derivatives`` may grow beyond all bounds and end the prediction.
+    """
     if model == "motion":
-        return in_motion(motion, properties)
+        return in_motion(motion, properties, derivatives=derivatives)
     return at_rest(motion, properties, accelerated=model == "accelerated")
 
 
@@ -106,22 +111,27 @@ def _by_columns(rod: CosseratRod) -> Array:
     return by
 
 
-def in_motion(motion: CableMotion, properties: RodProperties) -> Prediction:
-    """A rod that starts as the cable did; derivatives are carried along exactly."""
+def in_motion(
+    motion: CableMotion, properties: RodProperties, *, derivatives: bool = True
+) -> Prediction:
+    """A rod that starts as the cable did; ``derivatives`` are carried along exactly, or zero."""
     rod = CosseratRod(properties, motion.n_elements, clamp=motion.clamp)
     prediction = _nothing(motion)
     try:
         state, sensitivity = start(rod, motion)
         for sample in range(len(motion)):
             if sample:
-                state, sensitivity = rod.advance_with_sensitivity(
-                    sensitivity,
-                    state.boundary.displacement_to(motion.boundary(sample)),
-                    float(motion.stamps[sample] - motion.stamps[sample - 1]),
-                    dt=LARGEST_STEP,
-                )
+                step = state.boundary.displacement_to(motion.boundary(sample))
+                duration = float(motion.stamps[sample] - motion.stamps[sample - 1])
+                if derivatives:
+                    state, sensitivity = rod.advance_with_sensitivity(
+                        sensitivity, step, duration, dt=LARGEST_STEP
+                    )
+                else:
+                    state = rod.advance(step, duration, dt=LARGEST_STEP)
             prediction.points[sample] = motion.weights @ state.positions
-            prediction.by[sample] = np.tensordot(motion.weights, sensitivity.positions, 1)
+            if derivatives:
+                prediction.by[sample] = np.tensordot(motion.weights, sensitivity.positions, 1)
     except (RodDiverged, ValueError):  # ValueError: a rod shorter than the clamps' distance
         pass
     return prediction
