@@ -1,9 +1,11 @@
 """A rod's properties as the kernels' arrays."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod._kernels_energy import RodArrays
+from dlo_gym.rod._kernels_inertia import NO_INERTIA, Inertia
 from dlo_gym.rod.properties import RodProperties, per_element
 
 RIGID_JOINT = 1e-3  # of an element: the piece between clamp and element when it holds the element
@@ -62,3 +64,24 @@ def node_weights(properties: RodProperties, n: int, gravity: Array) -> Array:
     nodes[:-1] += 0.5 * mass
     nodes[1:] += 0.5 * mass
     return nodes[:, None] * gravity
+
+
+def springs_of(targets: ArrayLike, stiffness: ArrayLike, n: int) -> Inertia:
+    """Springs [N/m], one stiffness or (n + 1,), between the nodes and ``targets`` (n + 1, 3) [m].
+
+    Raises:
+        ValueError: on a wrong shape or a value that is not finite, or negative stiffness.
+    """
+    targets = np.asarray(targets, dtype=np.float64)
+    if targets.shape != (n + 1, 3) or not np.isfinite(targets).all():
+        raise ValueError(
+            f"targets: expected finite values of shape ({n + 1}, 3), got {targets.shape}"
+        )
+    springs = per_element(stiffness, n + 1)
+    if not (np.isfinite(springs) & (springs >= 0.0)).all():
+        raise ValueError(f"stiffness: expected finite values from 0 up [N/m], got {springs}")
+    if not springs.any():
+        return NO_INERTIA
+    return Inertia(
+        np.concatenate([springs, np.zeros(2 * n)]), np.concatenate([targets, np.zeros((2 * n, 3))])
+    )

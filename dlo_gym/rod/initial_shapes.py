@@ -1,4 +1,4 @@
-"""Shapes to start a rod from: straight, arc, catenary, hanging between clamps, random clamps."""
+"""Shapes to start a rod from: straight, arc, catenary, hanging between clamps; random clamps."""
 
 from collections.abc import Callable
 from math import isfinite
@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
 from dlo_gym.geometry import curves
-from dlo_gym.geometry.se3 import Array, exp_so3, frame_along, pose
+from dlo_gym.geometry.se3 import Array, exp_so3, frame_along, log_so3, matrix_to_quaternion, pose
 from dlo_gym.rod.boundary import BoundaryPoses
 
 
@@ -138,3 +138,20 @@ def _check_curve(length: float, n_nodes: int) -> None:
 def _root(function: Callable[[float], float], low: float, high: float) -> float:
     root: Any = brentq(function, low, high, xtol=1e-15)
     return float(root)
+
+
+def frames_along(positions: Array, boundary: BoundaryPoses) -> Array:
+    """Quaternions (n, 4) along a centerline, with the twist between the clamps spread evenly."""
+    tangents = np.diff(positions, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    if boundary.right is None:
+        frames = curves.parallel_transport(tangents, boundary.left[:3, :3])
+    else:
+        carried = curves.parallel_transport(
+            np.concatenate([tangents, boundary.right[None, :3, 2]]), boundary.left[:3, :3]
+        )
+        frames, last = carried[:-1], carried[-1]
+        twist = log_so3(last.T @ boundary.right[:3, :3])[2]
+        angles = twist * (np.arange(len(frames)) + 0.5) / len(frames)
+        frames = frames @ exp_so3(angles[:, None] * np.array([0.0, 0.0, 1.0]))
+    return matrix_to_quaternion(frames)

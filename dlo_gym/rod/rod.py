@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dlo_gym.exceptions import RodDiverged
-from dlo_gym.geometry.curves import parallel_transport
-from dlo_gym.geometry.se3 import Array, exp_so3, log_so3, matrix_to_quaternion
+from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod import _kernels_dynamics as dynamics_kernels
 from dlo_gym.rod import _kernels_energy as energy_kernels
 from dlo_gym.rod import _kernels_move as move_kernels
@@ -17,18 +16,18 @@ from dlo_gym.rod import contact_dynamics, contact_moves
 from dlo_gym.rod._kernels_assembly import System
 from dlo_gym.rod._kernels_clamps import clamp_frame
 from dlo_gym.rod._kernels_dynamics import Plan
-from dlo_gym.rod._kernels_inertia import NO_INERTIA, Inertia
-from dlo_gym.rod._kernels_moment import hidden_energy
+from dlo_gym.rod._kernels_inertia import NO_INERTIA
 from dlo_gym.rod._kernels_rates import kinetic_energy
 from dlo_gym.rod._kernels_sensitivity import Carried
-from dlo_gym.rod.arrays import node_weights, rod_arrays
+from dlo_gym.rod.arrays import node_weights, rod_arrays, springs_of
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.contact import ContactModel, check_clamps
 from dlo_gym.rod.dynamics import clamp_path, damping_wrenches, empty_work, motion_of, plan_of
-from dlo_gym.rod.initial_shapes import hanging
+from dlo_gym.rod.initial_shapes import frames_along, hanging
+from dlo_gym.rod.limits import bounds_of, limits_of
 from dlo_gym.rod.obstacles import Obstacle, check_obstacles
 from dlo_gym.rod.plausibility import problem_of
-from dlo_gym.rod.properties import RodProperties, per_element
+from dlo_gym.rod.properties import RodProperties
 from dlo_gym.rod.sensitivity import (
     MOTION_PARAMETERS,
     PARAMETERS,
@@ -45,10 +44,6 @@ from dlo_gym.rod.sensitivity import (
 from dlo_gym.rod.state import RodMemory, RodState
 
 GRAVITY = (0.0, 0.0, -9.81)
-TOLERANCE = 1e-9  # residual relative to the rod's own weight and stiffness
-LARGEST_STRAIN = 0.25  # beside what a few times the rod's own weight stretches
-LARGEST_BEND = 2.4  # between neighbouring elements [rad]
-LARGEST_MOVE = (0.08, 0.3)  # of one sub-step: translation per rod length, rotation [rad]
 
 
 class CosseratRod:
@@ -98,24 +93,8 @@ class CosseratRod:
         self._arrays = rod_arrays(properties, n_elements, self.gravity, clamp)
         self._system = System(self._arrays, NO_INERTIA)
         self._motion = motion_of(properties, n_elements, self._arrays.rest_curvature.copy())
-        stiffness = float(self._arrays.bending[:, 0].mean())
-        weight = float(np.abs(self._arrays.forces).sum())
-        # Differences of coordinates of about 1 m carry this much of rounding error in the force
-        # times an element's length.
-        rounding = np.finfo(np.float64).eps * self._arrays.shear[:, 2].max()
-        element = properties.length / n_elements
-        self._limits = kernels.Limits(
-            residual=TOLERANCE,
-            force=stiffness / properties.length**2 + weight + 8.0 * rounding / element / TOLERANCE,
-            torque=stiffness / properties.length + weight * element + rounding / TOLERANCE,
-        )
-        softest = self._arrays.shear[:, 2].min()
-        self._bounds = move_kernels.Bounds(
-            translation=LARGEST_MOVE[0] * properties.length,
-            rotation=LARGEST_MOVE[1],
-            strain=LARGEST_STRAIN + 3.0 * weight / softest,
-            bend=LARGEST_BEND,
-        )
+        self._limits = limits_of(properties, self._arrays)
+        self._bounds = bounds_of(properties, self._arrays)
         self._work = empty_work(n_elements)
         self._boundary: BoundaryPoses | None = None
         self._energy = 0.0
@@ -156,25 +135,7 @@ class CosseratRod:
         Raises:
             ValueError: on a wrong shape or a value that is not finite, or negative stiffness.
         """
-        targets = np.asarray(targets, dtype=np.float64)
-        if targets.shape != (self.n_nodes, 3) or not np.isfinite(targets).all():
-            raise ValueError(
-                f"targets: expected finite values of shape ({self.n_nodes}, 3), got {targets.shape}"
-            )
-        springs = per_element(stiffness, self.n_nodes)
-        if not (np.isfinite(springs) & (springs >= 0.0)).all():
-            raise ValueError(f"stiffness: expected finite values from 0 up [N/m], got {springs}")
-        if not springs.any():
-            self._system = System(self._arrays, NO_INERTIA)
-            return
-        directors = 2 * self.n_elements
-        self._system = System(
-            self._arrays,
-            Inertia(
-                np.concatenate([springs, np.zeros(directors)]),
-                np.concatenate([targets, np.zeros((directors, 3))]),
-            ),
-        )
+        self._system = System(self._arrays, springs_of(targets, stiffness, self.n_elements))
 
     def settle(self, boundary: BoundaryPoses, start: ArrayLike | None = None) -> RodState:
         """Find the equilibrium between clamps from afar.
@@ -205,7 +166,7 @@ class CosseratRod:
         positions[0] = boundary.left[:3, 3]
         if boundary.right is not None:
             positions[-1] = boundary.right[:3, 3]
-        self._set(positions, _frames_along(positions, boundary), boundary)
+        self._set(positions, frames_along(positions, boundary), boundary)
         self._contact.let_go()
         problem, _ = self._go(np.zeros(12), descend=True)
         if problem:
@@ -557,25 +518,6 @@ class CosseratRod:
             relaxed = self._motion.creep * self._creep
             self._arrays.rest_curvature[:] = self._motion.rest_curvature + relaxed
 
-    def _flow(self) -> None:
-        """Take what has bent plastically as given before the next solve."""
-        if self._motion.yields:
-            plastic = np.empty((self.n_nodes, 2))
-            energy_kernels.flow_plastically(self._arrays, self._strains()[1], plastic)
-            self._arrays.plastic[:] = plastic
-
-    def _stored(self, potential: float) -> float:
-        """Energy [J] stored, of an incremental potential that counts what was dissipated."""
-        if not self._motion.yields and self._motion.creep == 0.0:
-            return potential
-        plastic = np.empty((self.n_nodes, 2))
-        lost = energy_kernels.flow_plastically(self._arrays, self._strains()[1], plastic)
-        return (
-            potential
-            - lost
-            + hidden_energy(self._motion, self._arrays, self._creep, self._arrays.plastic)
-        )
-
     def _check_boundary(self, boundary: BoundaryPoses, obstacles: Sequence[Obstacle]) -> None:
         check_clamps(boundary, obstacles, self._contact.radii)
         if boundary.distance >= self.properties.length:
@@ -602,13 +544,19 @@ class CosseratRod:
     def _shape(self):
         return self._system, self._x, self._q, self._ends
 
-    def _linearise(self) -> int:
+    def _linearise(self) -> None:
         if self._contact.possible:
-            potential, negative = self._contact.linearise(self._shape, self._work)
+            potential, _ = self._contact.linearise(self._shape, self._work)
         else:
-            potential, negative = kernels.linearise(*self._shape, self._work)
-        self._energy = self._stored(potential)
-        return negative
+            potential, _ = kernels.linearise(*self._shape, self._work)
+        self._energy = move_kernels.judge(self._held, potential)[2]
+
+    @property
+    def _held(self) -> move_kernels.Held:
+        return move_kernels.Held(
+            self._system, self._motion, self._x, self._q, self._creep, self._clamps, self._ends,
+            self._limits, self._bounds, self._work,
+        )  # fmt: skip
 
     def _go(
         self,
@@ -618,22 +566,18 @@ class CosseratRod:
         obstacles: Sequence[Obstacle] | None = None,
     ) -> tuple[str, float]:
         """Move by ``twist`` (12,), or ``descend`` from any shape: what is wrong, and where."""
-        held = move_kernels.Held(
-            self._system, self._motion, self._x, self._q, self._creep, self._clamps, self._ends,
-            self._limits, self._bounds, self._work,
-        )  # fmt: skip
         if self._contact.possible:
             problem, reached, self._energy = contact_moves.move(
-                self._contact, held, self._energy, twist, descend, obstacles
+                self._contact, self._held, self._energy, twist, descend, obstacles
             )
             return problem, reached
-        outcome = move_kernels.move(held, self._energy, twist, descend)
+        outcome = move_kernels.move(self._held, self._energy, twist, descend)
         self._energy = outcome.energy
         return problem_of(outcome.status, outcome.measure, self._bounds), outcome.reached
 
     def _implausible(self) -> str:
         """What is wrong with the present shape, or ""."""
-        status, measure = move_kernels.plausible(self._arrays, *self._strains(), self._bounds)
+        status, measure, _ = move_kernels.judge(self._held, 0.0)
         problem = problem_of(status, measure, self._bounds)
         if problem or not self._contact.possible:
             return problem
@@ -659,20 +603,3 @@ class CosseratRod:
             self._spins,
         )  # fmt: skip
         return wrenches if self._ends.right_held else wrenches * [[1.0], [0.0]]
-
-
-def _frames_along(positions: Array, boundary: BoundaryPoses) -> Array:
-    """Quaternions (n, 4) along a centerline, with the twist between the clamps spread evenly."""
-    tangents = np.diff(positions, axis=0)
-    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    if boundary.right is None:
-        frames = parallel_transport(tangents, boundary.left[:3, :3])
-    else:
-        carried = parallel_transport(
-            np.concatenate([tangents, boundary.right[None, :3, 2]]), boundary.left[:3, :3]
-        )
-        frames, last = carried[:-1], carried[-1]
-        twist = log_so3(last.T @ boundary.right[:3, :3])[2]
-        angles = twist * (np.arange(len(frames)) + 0.5) / len(frames)
-        frames = frames @ exp_so3(angles[:, None] * np.array([0.0, 0.0, 1.0]))
-    return matrix_to_quaternion(frames)
