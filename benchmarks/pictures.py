@@ -1,7 +1,7 @@
 """An animated picture of every task, for the docs: ``python -m benchmarks.pictures``."""
 
 from argparse import ArgumentParser
-from math import ceil
+from math import ceil, tau
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,6 +12,8 @@ from PIL import Image, ImageDraw, ImageFont
 from control.evaluate import gate_for, make_controller, make_env, run_episode
 from dlo_gym.atomic_file import written_aside
 from dlo_gym.envs.shape_env import ShapeControlEnv
+from dlo_gym.envs.wrap_bar_env import WrapBarEnv
+from dlo_gym.envs.wrap_bar_script import WrapScript
 from dlo_gym.exceptions import DloError
 from dlo_gym.geometry.camera import CameraModel, View
 from dlo_gym.geometry.se3 import Array
@@ -48,10 +50,17 @@ HANGING = (
     camera("side", (0.1, -1.05, 0.6), (-0.1, 0.0, 0.42)),
     camera("top", (-0.1, -0.05, 1.4), (-0.1, 0.02, 0.5), up=(0.0, 1.0, 0.0)),
 )
+AROUND_THE_BAR = (
+    camera("side", (0.1, -0.95, 0.6), (0.0, 0.1, 0.4)),
+    camera("along the bar", (0.3, -0.75, 0.75), (0.0, 0.1, 0.38)),
+)
 
 
 class Episode(NamedTuple):
-    """What is shown of a task: a controller's way from the start to the goal of a seed."""
+    """What is shown of a task: a controller's way from the start to the goal of a seed.
+
+    The controller ``"script"`` is that of the wrap-bar task.
+    """
 
     controller: str = "mpc"
     seed: int = 0
@@ -67,14 +76,16 @@ EPISODES = {
     "ShapeControlHard": Episode(seed=1, cameras=WIDE),
     "ShapeControlPlanar": Episode(),
     "ShapeControlOneArm": Episode(cameras=HANGING),
+    "ShapeControlObstacle": Episode(controller="over", max_steps=100, cameras=WIDE),
+    "WrapBar": Episode(controller="script", max_steps=150, cameras=AROUND_THE_BAR),
 }
 
 
 def frames(name: str, episode: Episode) -> list[NDArray[np.uint8]]:
-    """Both views with the goal drawn in, step by step until the cable lies on it.
+    """Both views, with the goal drawn in where it is a shape, step by step until it is reached.
 
     Raises:
-        DloError: if it does not arrive.
+        DloError: if it is not.
     """
     env = make_env(
         f"dlo_gym/{name}-v0",
@@ -84,6 +95,8 @@ def frames(name: str, episode: Episode) -> list[NDArray[np.uint8]]:
     )
     inner = env.unwrapped
     assert isinstance(inner, ShapeControlEnv)
+    if isinstance(inner, WrapBarEnv):
+        return wound_frames(inner, episode)
     gate = gate_for(inner.config)
     controller = make_controller(episode.controller, gate.limits, inner.config)
     made, error = [], np.inf
@@ -99,22 +112,44 @@ def frames(name: str, episode: Episode) -> list[NDArray[np.uint8]]:
     return made
 
 
+def wound_frames(env: WrapBarEnv, episode: Episode) -> list[NDArray[np.uint8]]:
+    """Both views while the script winds the cable round the bar."""
+    env.reset(seed=episode.seed)
+    script, made = WrapScript(env), []
+    for _ in range(episode.max_steps):
+        *_, terminated, _, info = env.step(script.action())
+        image = np.hstack([smooth(view) for view in env.cell.views()])
+        text = f"{env.cell.stamp:.1f} s, {info['winding'] / tau:.2f} turns round the"
+        made.append(captioned(image, text, "bar"))
+        if terminated or info["success"]:
+            break
+    env.close()
+    if not info["success"]:
+        raise DloError(f"{env.config}: {info['winding'] / tau:.2f} turns at the end")
+    return made
+
+
+def smooth(view: View) -> NDArray[np.uint8]:
+    """The oversampled view at its size."""
+    return np.array(Image.fromarray(view.image).reduce(OVERSAMPLED))
+
+
 def drawn(view: View, goal: Array) -> NDArray[np.uint8]:
     """The oversampled view at its size, with the goal (n, 3) [m] shining through it."""
-    image = np.array(Image.fromarray(view.image).reduce(OVERSAMPLED))
+    image = smooth(view)
     painted, seen_from = image.copy(), view.camera.scaled(1 / OVERSAMPLED)
     draw_centerline(painted, seen_from, goal, GOAL, thickness=GOAL_WIDTH)
     return np.asarray(Image.blend(Image.fromarray(image), Image.fromarray(painted), 0.6))
 
 
-def captioned(image: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
-    """With the text and, in its color, the word "goal" in the upper left corner."""
+def captioned(image: NDArray[np.uint8], text: str, about: str = "goal") -> NDArray[np.uint8]:
+    """With the text, and what it is ``about`` in the color of goals, in the upper left corner."""
     picture, font = Image.fromarray(image), ImageFont.load_default(13)
     draw = ImageDraw.Draw(picture)
     end = 8 + draw.textlength(f"{text} ", font=font)
-    draw.rectangle((0, 0, end + draw.textlength("goal", font=font) + 8, 22), fill=(30, 30, 30))
+    draw.rectangle((0, 0, end + draw.textlength(about, font=font) + 8, 22), fill=(30, 30, 30))
     draw.text((8, 3), text, font=font, fill=(240, 240, 240))
-    draw.text((end, 3), "goal", font=font, fill=(225, 140, 245))
+    draw.text((end, 3), about, font=font, fill=(225, 140, 245))
     return np.asarray(picture)
 
 

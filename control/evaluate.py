@@ -24,7 +24,7 @@ from control.mpc import ShapeMPC
 from control.policy import PolicyController
 from control.problem import MpcConfig
 from control.safety import SafetyGate, SafetyLimits
-from control.servo import EndServo
+from control.servo import EndServo, OverServo
 from dlo_gym.envs.config import ShapeEnvConfig
 from dlo_gym.envs.shape_env import ShapeControlEnv
 from dlo_gym.exceptions import SafetyStop, SolverFailed
@@ -220,7 +220,7 @@ def overall_metrics(episodes: Sequence[Sequence[Step]]) -> dict[str, Any]:
 
 def control(
     *,
-    controller: Literal["mpc", "servo", "rl"] = "mpc",
+    controller: Literal["mpc", "servo", "over", "rl"] = "mpc",
     env: str = "dlo_gym/ShapeControl-v0",
     observer: Literal["state", "tracked"] | None = None,
     model: Literal["surrogate", "rod"] | None = None,
@@ -239,8 +239,8 @@ def control(
     after every episode, so that an interrupted run loses nothing that was finished.
 
     Args:
-        controller: mpc; servo, which moves the grippers straight to the goal's ends; or rl for a
-            trained policy.
+        controller: mpc; servo, which moves the grippers straight to the goal's ends; over, which
+            lifts the cable over what stands in between; or rl for a trained policy.
         env: id of a shape-control environment.
         observer: state for the simulator's own state, tracked for the tracker on rendered views;
             what the environment id says when omitted.
@@ -366,7 +366,7 @@ def make_controller(
     """The controller ``name`` for environments with ``config``.
 
     Args:
-        name: ``"mpc"``, ``"servo"`` or ``"rl"``.
+        name: ``"mpc"``, ``"servo"``, ``"over"`` or ``"rl"``.
         limits: of the safety gate.
         config: of the environment.
         model: ``"surrogate"`` or ``"rod"``, for the MPC; ``default_model(config)`` when omitted.
@@ -382,6 +382,8 @@ def make_controller(
         return ShapeMPC(_model(model or default_model(config), config), limits, settings)
     if name == "servo":
         return EndServo(limits)
+    if name == "over":
+        return OverServo(limits)
     if name == "rl":
         if policy is None:
             raise ValueError("policy: the rl controller needs the file of a trained policy")
@@ -394,7 +396,7 @@ def make_controller(
                     f" has, got {got}"
                 )
         return controller
-    raise ValueError(f"controller: expected mpc, servo or rl, got {name!r}")
+    raise ValueError(f"controller: expected mpc, servo, over or rl, got {name!r}")
 
 
 def default_model(config: ShapeEnvConfig) -> str:

@@ -41,6 +41,22 @@ def test_the_goal_is_reached_through_the_gate(env, controller):
         assert last.shape_error < 1e-3
 
 
+def test_obstacles_bar_the_straight_way_and_can_be_gone_over():
+    env = make_env("dlo_gym/ShapeControlObstacle-v0")
+    config = env.unwrapped.config
+    gate = gate_for(config)
+    for seed in (0, 1):
+        *_, straight = run_episode(
+            env, make_controller("servo", gate.limits, config), gate, seed=seed, max_steps=80
+        )
+        *_, over = run_episode(
+            env, make_controller("over", gate.limits, config), gate, seed=seed, max_steps=80
+        )
+        assert over.success
+        assert not straight.success
+    env.close()
+
+
 @pytest.mark.parametrize("model", ["surrogate", "rod"])
 def test_in_the_plane_the_mpc_asks_for_nothing_that_leaves_it(model):
     env = make_env("dlo_gym/ShapeControlPlanar-v0")
