@@ -16,8 +16,9 @@ def test_python_examples_run(page, tmp_path, monkeypatch):
     text = (README.parent / page).read_text()
     examples = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
     assert examples
+    names = {}  # a page reads from top to bottom
     for example in examples:
-        exec(compile(example, page, "exec"), {})
+        exec(compile(example, page, "exec"), names)
 
 
 def test_pictures_and_documents_it_names_exist():

@@ -126,6 +126,7 @@ class Cell:
     """As much of a simulated cell as the observer may look at."""
 
     n_nodes = 51
+    obstacles = ()
 
     def __init__(self, recording):
         self.recording, self.sample = recording, 0

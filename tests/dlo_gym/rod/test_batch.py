@@ -83,7 +83,7 @@ def test_a_lost_rod_stays_and_the_others_go_on(monkeypatch):
 def test_a_rod_that_never_settled_is_nan():
     batch = RodBatch(rods(), threads=1)
     wanted = boundaries()
-    far = wanted[1].clamps[1]
+    far = wanted[1].clamps[1].copy()
     far[0, 3] += 2.0
     wanted[1] = replace(wanted[1], right=far)
     state = batch.settle(wanted)

@@ -55,23 +55,23 @@ def test_impossible_settings(kind, change, message):
 OPTIONS = {
     "rollouts": (
         lambda folder: rollouts(folder, resume=True, overwrite=True),
-        "resume, overwrite: expected at most one of them, got both",
+        "resume, overwrite: expected one of them at most, got both",
     ),
     "sweep": (
         lambda folder: evaluate_surrogate(folder, resume=True, overwrite=True),
-        "resume, overwrite: expected at most one of them, got both",
+        "resume, overwrite: expected one of them at most, got both",
     ),
     "training": (
         lambda folder: train_surrogate(folder, resume=True, overwrite=True),
-        "resume, overwrite: expected at most one of them, got both",
+        "resume, overwrite: expected one of them at most, got both",
     ),
     "weights that are not used": (
         lambda folder: train_surrogate(folder, weights=SHIPPED),
-        "weights: expected with evaluate only",
+        "weights: training starts from none",
     ),
     "evaluation that writes": (
         lambda folder: train_surrogate(folder, evaluate=True, overwrite=True),
-        "evaluate: expected without resume and overwrite",
+        "evaluate: trains nothing; expected neither resume nor overwrite",
     ),
     "threads": (
         lambda folder: train_surrogate(folder, threads=0),
