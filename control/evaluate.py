@@ -4,7 +4,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, sqrt
 from pathlib import Path
 from time import perf_counter
@@ -27,6 +27,7 @@ from control.safety import SafetyGate, SafetyLimits
 from control.servo import EndServo, OverServo
 from dlo_gym.envs.config import ShapeEnvConfig
 from dlo_gym.envs.shape_env import ShapeControlEnv
+from dlo_gym.envs.wrap_bar_env import WrapBarEnv
 from dlo_gym.exceptions import SafetyStop, SolverFailed
 from dlo_gym.executor import in_order, run_tasks
 from dlo_gym.geometry.se3 import Array
@@ -378,17 +379,23 @@ def make_controller(
         WeightsError: if the weights of the surrogate or the policy are missing or damaged.
     """
     if name == "mpc":
+        if config.axial_rotation:  # of the three turns of an action the MPC plans two
+            limits = replace(limits, max_rotation_step=sqrt(2.0) * config.max_rotation_step)
         settings = MpcConfig(n_clamps=config.n_clamps, planar=config.planar)
         return ShapeMPC(_model(model or default_model(config), config), limits, settings)
     if name == "servo":
-        return EndServo(limits)
+        return EndServo(limits, planar=config.planar)
     if name == "over":
-        return OverServo(limits)
+        return OverServo(limits, planar=config.planar)
     if name == "rl":
         if policy is None:
             raise ValueError("policy: the rl controller needs the file of a trained policy")
         controller = PolicyController(policy)
-        moves = {"n_clamps": config.n_clamps, "planar": config.planar}
+        moves = {
+            "n_clamps": config.n_clamps,
+            "planar": config.planar,
+            "axial_rotation": config.axial_rotation,
+        }
         for what, expected in moves.items():
             if (got := getattr(controller.policy.action, what)) != expected:
                 raise ValueError(
@@ -434,8 +441,10 @@ def write_metrics(path: Path, metrics: dict[str, Any]) -> None:
 
 def _shape_env(env: gym.Env) -> ShapeControlEnv:
     inner = env.unwrapped
-    if not isinstance(inner, ShapeControlEnv):
-        raise ValueError(f"env: expected a shape-control environment, got {type(inner).__name__}")
+    if not isinstance(inner, ShapeControlEnv) or isinstance(inner, WrapBarEnv):
+        raise ValueError(
+            f"env: expected a task whose goal is a shape, got a {type(inner).__name__}"
+        )
     return inner
 
 

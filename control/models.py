@@ -4,6 +4,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from dlo_gym.exceptions import RodDiverged
 from dlo_gym.geometry.se3 import Array, exp_so3
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.properties import RodProperties
@@ -196,7 +197,10 @@ class RodModel:
             raise ValueError("model: the rod is not known yet; call reset(boundary, properties)")
         displacement = self._rod.state.boundary.displacement_to(boundary)
         if np.abs(displacement.vector).max() > 1e-9:
-            self._rod.move(displacement)
+            try:
+                self._rod.move(displacement)
+            except RodDiverged:  # it may have been left behind, and has too far to go
+                self._rod.settle(boundary)
         return self._rod
 
 

@@ -18,13 +18,14 @@ class EndServo:
     """Moves the clamps straight to the goal's ends and tangents, blind to what is in between.
 
     Args:
-        limits: of the safety gate; one step's translation fits into the box inside them.
+        limits: of the safety gate; what a step goes along each axis keeps them together.
+        planar: whether two axes are all there are.
     """
 
     diagnostics = ControlDiagnostics()
 
-    def __init__(self, limits: SafetyLimits) -> None:
-        self._step = limits.translation_step / sqrt(3.0)
+    def __init__(self, limits: SafetyLimits, *, planar: bool = False) -> None:
+        self._step = limits.translation_step / sqrt(2.0 if planar else 3.0)
 
     def reset(self, goal: Array, boundary: BoundaryPoses, properties: RodProperties) -> None:
         pass
@@ -39,16 +40,16 @@ class OverServo:
     """Lifts the clamps, goes above the goal's ends, and lets the cable down on them.
 
     Args:
-        limits: of the safety gate.
+        limits, planar: as of ``EndServo``.
         lift: above the clamps' start and the goal's ends [m], as far as the workspace goes.
     """
 
     diagnostics = ControlDiagnostics()
 
-    def __init__(self, limits: SafetyLimits, lift: float = 0.15) -> None:
-        self._step = limits.translation_step / sqrt(3.0)
+    def __init__(self, limits: SafetyLimits, *, planar: bool = False, lift: float = 0.15) -> None:
+        self._step = limits.translation_step / sqrt(2.0 if planar else 3.0)
         self._lift, self._ceiling = lift, limits.workspace[1][2]
-        self._height = np.inf
+        self._height = self._ceiling
         self._risen = self._above = False
 
     def reset(self, goal: Array, boundary: BoundaryPoses, properties: RodProperties) -> None:

@@ -283,7 +283,7 @@ class SimulatedCell:
         moved = np.linalg.norm(ends - contact.points[[0, -1]][: len(ends)], axis=1)
         if (contact.gaps[:, [0, -1]][:, : len(ends)] > moved).all():
             return False
-        radius = float(np.max(self.properties.radius))
+        radius = self.rod_radius
         return any((body.signed_distance(ends) < radius).any() for body in contact.obstacles)
 
     def views(self) -> tuple[View, ...]:

@@ -178,12 +178,18 @@ class ShapeEnvConfig:
         workspace = np.asarray(self.workspace, dtype=np.float64)
         if workspace.shape != (2, 3) or not (workspace[0] < workspace[1]).all():
             raise ValueError(f"workspace: expected (lowest, highest) corners, got {self.workspace}")
-        longest = self.max_stretch * self.properties.length
+        longest = self.max_stretch * self.rod_length[0]
         if not self.min_gripper_distance < self.start_distance < longest:
             raise ValueError(
                 f"start_distance: expected between min_gripper_distance"
                 f" {self.min_gripper_distance} m and {longest:.4g} m, which is max_stretch times"
-                f" the rod's length, got {self.start_distance}"
+                f" the shortest rod's length, got {self.start_distance}"
+            )
+        element = self.rod_length[0] / self.n_elements
+        if self.thickest_rod > element:
+            raise ValueError(
+                "radius: expected no thicker rod, randomized or not, than the shortest one's"
+                f" elements are long, {element:.4g} m, got {self.thickest_rod:.4g} m"
             )
 
     @classmethod
@@ -209,6 +215,18 @@ class ShapeEnvConfig:
     @property
     def n_clamps(self) -> int:
         return 1 if self.free_end else 2
+
+    @property
+    def rod_length(self) -> tuple[float, float]:
+        """Of the shortest and of the longest rod [m]."""
+        sampled = None if self.randomization is None else self.randomization.length
+        return sampled or (self.properties.length, self.properties.length)
+
+    @property
+    def thickest_rod(self) -> float:
+        """The largest radius [m]."""
+        sampled = None if self.randomization is None else self.randomization.radius
+        return float(np.max(self.properties.radius)) if sampled is None else sampled[1]
 
     @property
     def touches(self) -> tuple[str, ...]:
@@ -248,8 +266,9 @@ class ShapeEnvConfig:
             value = self.friction or self.randomization.friction  # type: ignore[union-attr]
             raise ValueError(f"{name}: expected none without obstacles to rub on, got {value}")
         if self.standing_obstacles is not None:
-            low, high = np.asarray(self.standing_obstacles).ravel()[[0, -1]]
-            if np.shape(self.standing_obstacles) != (2,) or not 1 <= low <= high <= n:
+            numbers = np.asarray(self.standing_obstacles)
+            whole = numbers.shape == (2,) and np.issubdtype(numbers.dtype, np.integer)
+            if not whole or not 1 <= numbers[0] <= numbers[1] <= n:
                 raise ValueError(
                     f"standing_obstacles: expected (lowest, highest) number of {n} obstacles,"
                     f" got {self.standing_obstacles!r}"

@@ -3,8 +3,6 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
 from dlo_gym.envs.cell import SimulatedCell
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.overlay import GOAL, SEEN
@@ -52,7 +50,7 @@ class EpisodeViewer:
         """The cell as it is now, with what the observer made of it, and numbers to plot."""
         viewer, cell = self._viewer, self._cell
         self._set_time()
-        radius = float(np.max(cell.properties.radius))
+        radius = cell.rod_radius
         viewer.show_curve("cable", cell.rod_state.positions, cell.rod_color, radius=radius)
         for view in cell.views():
             viewer.show_image(view)

@@ -155,7 +155,7 @@ def _place(
 def _clear(cell: SimulatedCell, start: CellState, around: Way, body: Obstacle, touch: str) -> bool:
     """Whether the cable is clear of a body at the start and, unless it may touch it, on the way;
     and the clamps and arms always."""
-    margin = MARGIN + float(np.max(cell.properties.radius))
+    margin = MARGIN + cell.rod_radius
     ends = around.positions[:, [0, -1] if start.rod.boundary.right is not None else [0]]
     whole = around.positions if touch == "forbidden" else ends
     for points in (start.rod.positions, whole):

@@ -175,9 +175,10 @@ def reset_to_random_start(
     Raises:
         ValueError: if the options leave no start that the arms and the rod can take.
     """
+    middle = (0.0, 0.0, config.start_height)
     for _ in range(ATTEMPTS):
         try:
-            cell.reset(_random_start(rng, config), occluders)
+            cell.reset(level_clamps(middle, rng, config), occluders)
         except (UnreachablePose, RodDiverged, ValueError):
             continue
         ends = cell.boundary.clamps[None, :, :3, 3]
@@ -189,11 +190,15 @@ def reset_to_random_start(
     )
 
 
-def _random_start(rng: np.random.Generator, config: ShapeEnvConfig) -> BoundaryPoses:
+def level_clamps(
+    middle: ArrayLike, rng: np.random.Generator, config: ShapeEnvConfig
+) -> BoundaryPoses:
+    """Clamps ``start_distance`` apart along x around ``middle`` (3,) [m], level but for noise."""
     along_x = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # d3 = +x, d2 = +z
     clamps = []
     for side in (-0.5, 0.5):
-        position = np.array([side * config.start_distance, 0.0, config.start_height])
+        position = np.array(middle, dtype=np.float64)
+        position[0] += side * config.start_distance
         position += rng.uniform(-1.0, 1.0, 3) * config.start_noise[0]
         tilt = np.append(rng.uniform(-1.0, 1.0, 2) * config.start_noise[1], 0.0)
         if config.planar:

@@ -100,6 +100,8 @@ class ShapeControlVectorEnv(VectorEnv):
         mask: NDArray[np.bool_],
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode where ``mask`` (n,) says so, each with a seed and options of its own."""
+        if self._over is None and not mask.all():
+            raise gym.error.ResetNeeded("reset_mask: expected all environments the first time")
         which = np.flatnonzero(mask).tolist()
         infos: dict[str, Any] = {}
         for i, info in zip(which, self._begin(which, seeds, options), strict=True):

@@ -14,6 +14,7 @@ NOT_HERE = (
     "obstacles", "standing_obstacles", "planar", "free_end", "success_threshold", "start_height",
     "goal_moves", "goal_translation", "goal_rotation", "goal_distance", "straight_way",
 )  # fmt: skip
+CROSSING = 0.1  # y at which the cable lies across the bar [m]
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,6 @@ class WrapBarConfig(ShapeEnvConfig):
     OBSTACLE_KINDS: ClassVar[tuple[str, ...]] = ("bar", "stand")
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         defaults = {option.name: option.default for option in fields(type(self))}
         for name in NOT_HERE:
             if getattr(self, name) != defaults[name]:
@@ -65,6 +65,7 @@ class WrapBarConfig(ShapeEnvConfig):
                     f"{name}: expected none, for the cable is wound round a bar, got"
                     f" {getattr(self, name)!r}"
                 )
+        super().__post_init__()
         if not self.self_contact:
             raise ValueError(
                 "self_contact: expected True, for a cable that is wound meets itself, got False"
@@ -82,13 +83,14 @@ class WrapBarConfig(ShapeEnvConfig):
             raise ValueError(
                 f"hold_steps: expected an integer of at least 1, got {self.hold_steps!r}"
             )
-        if np.shape(self.bar_span) != (2,) or not self.bar_span[0] < self.bar_span[1]:
+        if np.shape(self.bar_span) != (2,) or not self.bar_span[0] < CROSSING < self.bar_span[1]:
             raise ValueError(
-                f"bar_span: expected the free end's y below the stand's [m], got {self.bar_span}"
+                f"bar_span: expected the free end's y below {CROSSING} m, where the cable lies, and"
+                f" the stand's above it, got {self.bar_span}"
             )
-        round_it = (abs(self.winding) + np.pi) * (self.bar_radius + np.max(self.properties.radius))
-        if round_it > 0.8 * self.properties.length:
+        round_it = (abs(self.winding) + np.pi) * (self.bar_radius + self.thickest_rod)
+        if round_it > 0.8 * self.rod_length[0]:
             raise ValueError(
                 f"winding: expected a cable longer than the way round the bar: {self.winding:.4g}"
-                f" rad take {round_it:.4g} m of a cable of {self.properties.length:.4g} m"
+                f" rad take {round_it:.4g} m of a cable of {self.rod_length[0]:.4g} m"
             )

@@ -13,15 +13,14 @@ from dlo_gym.envs import tasks
 from dlo_gym.envs.cell import sample_occluder_paths
 from dlo_gym.envs.config import ShapeEnvConfig
 from dlo_gym.envs.shape_env import ShapeControlEnv, shape_observation
-from dlo_gym.envs.wrap_bar_config import WrapBarConfig
+from dlo_gym.envs.wrap_bar_config import CROSSING, WrapBarConfig
 from dlo_gym.exceptions import RodDiverged, UnreachablePose
 from dlo_gym.geometry.curves import swept_angle
-from dlo_gym.geometry.se3 import Array, exp_so3, pose
-from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
+from dlo_gym.geometry.se3 import Array, pose
+from dlo_gym.rod.boundary import BoundaryDisplacement
 from dlo_gym.rod.obstacles import Box, Capsule
 
 TOUCH_COST = 0.1  # per step in which the cable does not touch the bar, in turns
-CROSSING = 0.1  # y at which the cable crosses the bar [m]
 ABOVE = 0.5  # the bar, in lengths of the cable: where it starts before it is laid on the bar
 LAID = 0.05  # height of the clamps above the bar's axis at the start [m]
 
@@ -137,7 +136,7 @@ class WrapBarEnv(ShapeControlEnv):
         for _ in range(tasks.ATTEMPTS):
             x, dz = rng.uniform(-1.0, 1.0, 2) * config.bar_noise
             bar = (float(x), config.bar_height + float(dz))
-            start = _start(bar, rng, config)
+            start = tasks.level_clamps((bar[0], CROSSING, bar[1] + LAID), rng, config)
             above = ABOVE * self.cell.properties.length if config.winding > 0 else 0.0
             lift = BoundaryDisplacement(*np.tile([0.0, 0.0, above, 0.0, 0.0, 0.0], (2, 1)))
             try:
@@ -169,7 +168,7 @@ class WrapBarEnv(ShapeControlEnv):
     def _make_observation_space(self) -> spaces.Dict:
         entries = dict(super()._make_observation_space().spaces)
         # No more turns than the cable has lengths of the bar's girth.
-        most = abs(self.config.winding) + self.config.properties.length / self.config.bar_radius
+        most = abs(self.config.winding) + self.config.rod_length[1] / self.config.bar_radius
         limit = np.array([tau + most, 1.0], dtype=np.float32)
         goal = spaces.Box(-limit, limit, dtype=np.float32)
         return spaces.Dict(entries | {"achieved_goal": goal, "desired_goal": goal})
@@ -179,7 +178,7 @@ class WrapBarEnv(ShapeControlEnv):
         shape = shape_observation(centerline, self.cell.boundary, centerline)
         between = 0.5 * (centerline[1:] + centerline[:-1])
         gaps = self.bar.signed_distance(np.concatenate([centerline, between]))
-        radius = float(np.max(self.cell.properties.radius))
+        radius = self.cell.rod_radius
         touching = gaps.min() < radius + self.config.touch_tolerance
         achieved = np.array([self.winding(centerline), touching], dtype=np.float32)
         return self._and_the_rest(
@@ -202,20 +201,6 @@ class WrapBarEnv(ShapeControlEnv):
 
     def _progress(self, info: dict[str, Any]) -> dict[str, float]:
         return {"turns": info["winding"] / tau}
-
-
-def _start(
-    bar: tuple[float, float], rng: np.random.Generator, config: WrapBarConfig
-) -> BoundaryPoses:
-    """Random clamps on both sides of a bar whose axis is at x, z [m]."""
-    along_x = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # d3 = +x, d2 = +z
-    clamps = []
-    for side in (-0.5, 0.5):
-        position = np.array([bar[0] + side * config.start_distance, CROSSING, bar[1] + LAID])
-        position += rng.uniform(-1.0, 1.0, 3) * config.start_noise[0]
-        tilt = np.append(rng.uniform(-1.0, 1.0, 2) * config.start_noise[1], 0.0)
-        clamps.append(pose(along_x @ exp_so3(tilt), position))
-    return BoundaryPoses(*clamps)
 
 
 def _bar_and_stand(bar: tuple[float, float], config: WrapBarConfig) -> tuple[Capsule, Box]:

@@ -212,8 +212,8 @@ def _open_viewer(rr: Any, stream: Any) -> None:
             " set; write an .rrd file instead (render_file of an environment), or forward the"
             f" port of a viewer elsewhere:  ssh -R {PORT}:localhost:{PORT} ..."
         )
-    beside = Path(sys.executable).with_name("rerun")  # of an environment that is not activated
-    executable = shutil.which("rerun") or str(beside)
+    beside = Path(sys.executable).with_name("rerun")
+    executable = str(beside) if beside.exists() else shutil.which("rerun") or "rerun"
     rr.spawn(port=PORT, executable_path=executable, recording=stream)
 
 

@@ -205,7 +205,7 @@ def test_bad_requests_are_refused(tmp_path):
         make_env("dlo_gym/ShapeControl-v0", no_such_option=1)
     with pytest.raises(ValueError, match="policy"):
         make_controller("rl", gate_for(ShapeEnvConfig()).limits, ShapeEnvConfig())
-    with pytest.raises(ValueError, match="shape-control"):
+    with pytest.raises(ValueError, match="goal is a shape"):
         control(env="CartPole-v1", out=tmp_path / "a")
     with pytest.raises(ValueError, match="episodes"):
         control(episodes=0, out=tmp_path / "b")

@@ -57,6 +57,20 @@ def test_obstacles_bar_the_straight_way_and_can_be_gone_over():
     env.close()
 
 
+def test_where_clamps_may_turn_about_the_rod_the_mpc_stays_within_the_action_box():
+    env = make_env("dlo_gym/ShapeControl-v0", axial_rotation=True)
+    inner = env.unwrapped
+    gate = gate_for(inner.config)
+    driver = make_controller("mpc", gate.limits, inner.config)
+    env.reset(seed=3)
+    driver.reset(inner.goal, inner.cell.boundary, inner.cell.properties)
+    command = driver.control(inner.estimate, inner.cell.boundary, inner.goal)
+    made = inner.action_to_displacement(inner.displacement_to_action(command)).vector
+    np.testing.assert_allclose(made, command.vector, atol=1e-8)
+    turns = np.linalg.norm(command.vector.reshape(4, 3)[1::2], axis=1)
+    assert turns.max() > 0.9 * inner.config.max_rotation_step  # a step that could have been cut
+
+
 @pytest.mark.parametrize("model", ["surrogate", "rod"])
 def test_in_the_plane_the_mpc_asks_for_nothing_that_leaves_it(model):
     env = make_env("dlo_gym/ShapeControlPlanar-v0")
@@ -117,6 +131,10 @@ def test_what_the_surrogate_does_not_know_is_refused(tmp_path):
         ({"controller": "rl", "model": "rod"}, "model: the rl controller takes none"),
         ({"controller": "servo", "policy": "p"}, "policy: the servo controller takes none"),
         ({"env": "dlo_gym/RobotShapeControl-v0"}, "env: cannot make .*RobotShapeControl"),
+        (
+            {"env": "dlo_gym/WrapBar-v0"},
+            "env: expected .* goal is a shape, got a WrapBar",
+        ),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(tmp_path, options, message):

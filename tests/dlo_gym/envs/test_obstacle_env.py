@@ -301,6 +301,8 @@ def test_friction_is_sampled_said_and_reaches_the_rod():
         ({"standing_obstacles": (0, 2)}, "standing_obstacles: expected .* of 3 obstacles, got"),
         ({"standing_obstacles": (1, 4)}, "standing_obstacles"),
         ({"standing_obstacles": 2}, "standing_obstacles"),
+        ({"standing_obstacles": ()}, "standing_obstacles"),
+        ({"standing_obstacles": (1.5, 2.5)}, "standing_obstacles"),
         ({"friction": -0.1}, "friction: expected a finite non-negative number, got -0.1"),
         ({"straight_way": "blocked"}, "straight_way: expected .any. with obstacles"),
     ],

@@ -212,3 +212,15 @@ def test_wrong_ranges_are_named(wrong, said):
 def test_a_wrong_option_is_named():
     with pytest.raises(ValueError, match="randomization: expected Randomization"):
         gym.make(STATE_ID, randomization={"radius": (0.002, 0.004)})
+
+
+@pytest.mark.parametrize(
+    ("sampled", "message"),
+    [
+        ({"length": (0.2, 0.5)}, "start_distance: .* the shortest rod's length"),
+        ({"radius": (0.002, 0.02)}, "radius: .*randomized or not, .* 0.01 m, got 0.02 m"),
+    ],
+)
+def test_rods_that_no_episode_could_start_with_are_refused_at_once(sampled, message):
+    with pytest.raises(ValueError, match=message):
+        gym.make("dlo_gym/ShapeControl-v0", randomization=Randomization(**sampled))

@@ -130,3 +130,12 @@ def test_wrong_arguments_are_refused():
         envs.reset(seed=[1, 2, 3])
     with pytest.raises(ValueError, match="reset_mask"):
         envs.reset(options={"reset_mask": np.zeros(2, dtype=bool)})
+
+
+def test_the_first_reset_is_of_all():
+    envs = gym.make_vec("dlo_gym/ShapeControl-v0", 2, autoreset_mode="Disabled")
+    with pytest.raises(gym.error.ResetNeeded, match="all environments the first time"):
+        envs.reset(options={"reset_mask": np.array([True, False])})
+    with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\)"):
+        envs.step(envs.action_space.sample())
+    envs.close()
