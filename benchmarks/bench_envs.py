@@ -1,4 +1,4 @@
-"""What a straight servo and the MPC reach on each task: ``python -m benchmarks.bench_envs``."""
+"""What the servos and the MPC reach on each task: ``python -m benchmarks.bench_envs``."""
 
 from argparse import ArgumentParser
 
@@ -40,7 +40,9 @@ def final_metrics(
 def main() -> None:
     parser = ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--tasks", nargs="+", default=["Easy", "", "Medium", "Hard", "Planar", "OneArm"]
+        "--tasks",
+        nargs="+",
+        default=["Easy", "", "Medium", "Hard", "Planar", "OneArm", "Obstacle"],
     )
     parser.add_argument("--episodes", type=int, default=5)
     arguments = parser.parse_args()
@@ -48,7 +50,8 @@ def main() -> None:
         env = make_env(f"dlo_gym/ShapeControl{task}-v0")
         config = env.unwrapped.config  # type: ignore[attr-defined]
         gate = gate_for(config)
-        for name in ("bare servo", "servo", "mpc"):
+        over = ("over",) if config.obstacles else ()
+        for name in ("bare servo", "servo", "mpc", *over):
             driver = make_controller(name.removeprefix("bare "), gate.limits, config)
             episodes = [
                 bare_episode(env, driver, seed)
