@@ -17,13 +17,13 @@ from rich.table import Table
 from benchmarks import deform_mocap
 from dlo_gym.geometry.se3 import Array
 from sim2real.identification.cable_motion import CableMotion
-from sim2real.identification.estimate import Identified, identify
+from sim2real.identification.estimate import Identified, fit
 from sim2real.identification.parameters import grips_of, values_of
 from sim2real.identification.prediction import predict
 from sim2real.identify import summary
 
 WINDOW = 1.0  # a clip to identify from starts anew from what was seen after so long [s]
-PICTURE = Path("out/real_cables.png")
+PICTURES = Path("out/real_cables")  # the first unseen clip of every cable
 METHODS = ("in motion", "at rest", "blend")
 
 
@@ -50,14 +50,14 @@ def predictions(motion: CableMotion, found: Identified) -> list[Array]:
     ]
 
 
-def draw(motion: CableMotion, points: list[Array], title: str) -> None:
-    """Mean distance over time, and three samples of a clip from the side."""
+def draw(motion: CableMotion, points: list[Array], cable: str) -> None:
+    """Mean distance over time, and three samples of an unseen clip from the side."""
     figure = Figure(figsize=(11, 3.4), layout="constrained")
     over_time, *shapes = figure.subplots(1, 4)
     for method, predicted in zip(METHODS, points, strict=True):
         apart = 1e3 * np.nanmean(np.linalg.norm(predicted - motion.points, axis=2), axis=1)
         over_time.plot(motion.stamps - motion.stamps[0], apart, label=method)
-    over_time.set(xlabel="time [s]", ylabel="mean distance [mm]", title=title)
+    over_time.set(xlabel="time [s]", ylabel="mean distance [mm]", title=f"{cable}, unseen")
     over_time.legend(fontsize="small")
     for axes, sample in zip(
         shapes, np.linspace(0, len(motion) - 1, 4).astype(int)[1:], strict=True
@@ -67,8 +67,8 @@ def draw(motion: CableMotion, points: list[Array], title: str) -> None:
             axes.plot(*predicted[sample][:, [0, 2]].T, label=method)
         time = motion.stamps[sample] - motion.stamps[0]
         axes.set(xlabel="x [m]", ylabel="z [m]", aspect="equal", title=f"{time:.1f} s")
-    PICTURE.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(PICTURE, dpi=90)
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    figure.savefig(PICTURES / f"{cable}.png", dpi=90)
 
 
 def measure(cable: str, table: Table, console: Console) -> None:
@@ -76,7 +76,7 @@ def measure(cable: str, table: Table, console: Console) -> None:
     known, unseen = deform_mocap.load(cable)
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task(cable, total=None)
-        found = identify(
+        found = fit(
             [window for motion in known for window in motion.windows(WINDOW)],
             callback=lambda rms: progress.update(
                 task, description=f"{cable}: {1e3 * rms:.1f} mm RMS"
@@ -90,7 +90,7 @@ def measure(cable: str, table: Table, console: Console) -> None:
                 points = predictions(motion, found)
                 errors.append([1e3 * motion.mean_distance(p) for p in points])
                 if kind == "unseen" and index == 0:
-                    draw(motion, points, f"{cable}, unseen")
+                    draw(motion, points, cable)
             console.print(f"{cable}, {kind}, mm per clip:\n{np.round(errors, 1)}")
             followed = np.array(errors)[np.isfinite(errors).all(axis=1)]
             lost = len(errors) - len(followed)

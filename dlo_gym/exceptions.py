@@ -52,6 +52,10 @@ class SolverFailed(DloError):
     """The optimisation behind a controller gave no usable answer."""
 
 
+class IdentificationFailed(DloError):
+    """No rod of plausible parameters could follow how a cable moved."""
+
+
 class DeviceError(DloError):
     """An arm, gripper or camera cannot be reached, went silent, or refused what it was asked."""
 

@@ -14,12 +14,12 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from dlo_gym.exceptions import IdentificationFailed
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.output_folder import check_output_folder, replace_folder
 from dlo_gym.recording import Recording
 from sim2real.identification.cable_motion import CableMotion
-from sim2real.identification.estimate import Identified
-from sim2real.identification.estimate import identify as fit
+from sim2real.identification.estimate import Identified, fit
 from sim2real.identification.prediction import Model, predict
 from tracking.evaluate import Track, follow, make_tracker, rod_properties
 
@@ -31,7 +31,7 @@ def identify(
     recording: Annotated[Path, tyro.conf.Positional],
     *,
     source: Annotated[Literal["truth", "estimate"], tyro.conf.arg(name="from")] = "estimate",
-    output: Path | None = None,
+    out: Path | None = None,
     model: Literal["auto", "rest", "motion"] = "auto",
     youngs_modulus: float | None = None,
     overwrite: bool = False,
@@ -40,24 +40,30 @@ def identify(
 
     Writes identified.json (values, 95 % intervals, what the motion does not tell, the rod's
     properties), rod.toml (the [rod] section of a cell file) and fit.png. No force is measured, so
-    stiffness comes as its ratio to weight; that of a metre is the recording's density and radius.
+    what is found is the ratio of stiffness to weight; for the weight the recording's density is
+    taken, 1000 kg/m^3 if it does not say, and its radius.
 
     Args:
         recording: folder in the format dlo-recording/1.
         source: truth of the recording, or what the tracker makes of its images.
-        output: folder to make; out/identify-<name of the recording> if omitted.
+        out: folder to make; out/identify-<name of the recording> if omitted.
         model: "rest" takes the cable to be in equilibrium in every sample, "motion" gives it
             inertia and damping; "auto" tries both and keeps the one that fits better.
         youngs_modulus: that the tracker is to assume [Pa], if the recording does not say; 1e6
-            otherwise.
+            otherwise. Only with --from estimate.
         overwrite: replace the folder if it exists.
     """
     console = Console()
     recorded = Recording.load(recording)
-    folder = (output or Path("out") / f"identify-{recorded.name}").resolve()
+    folder = (out or Path("out") / f"identify-{recorded.name}").resolve()
     check_output_folder(folder, MADE, overwrite=overwrite)
     if source == "truth" and recorded.centerline is None:
         raise ValueError(f"from: {recorded.name} has no truth.npz; take --from estimate")
+    if source == "truth" and youngs_modulus is not None:
+        raise ValueError(
+            f"youngs_modulus: expected none with --from truth, which tracks nothing,"
+            f" got {youngs_modulus:g}"
+        )
     with Progress(console=console, transient=True) as progress:
         motion = (
             motion_of_truth(recorded) if source == "truth"
@@ -69,7 +75,8 @@ def identify(
     partial.mkdir(parents=True)
     try:
         report = {"recording": recorded.name, "from": source, "model": fitted, **as_json(found)}
-        (partial / "identified.json").write_text(json.dumps(report, indent=1) + "\n")
+        text = json.dumps(report, indent=1, allow_nan=False)
+        (partial / "identified.json").write_text(text + "\n")
         (partial / "rod.toml").write_text(as_toml(found, recorded))
         draw(partial / "fit.png", motion, found, fitted)
         replace_folder(partial, folder)
@@ -103,26 +110,31 @@ def motion_of_track(
 def _fitted(
     motion: CableMotion, model: Literal["auto", "rest", "motion"], progress: Progress
 ) -> tuple[Identified, Model]:
-    """The better of the models asked for."""
+    """The better of the models asked for; one that cannot follow the motion is left out."""
     models: tuple[Model, ...] = ("rest", "motion") if model == "auto" else (model,)
     fits: list[tuple[Identified, Model]] = []
     for kind in models:
         task = progress.add_task(f"fitting, {kind}", total=None)
-        found = fit(
-            [motion], model=kind,
-            callback=lambda rms, task=task, kind=kind: progress.update(
-                task, description=f"fitting, {kind}: {1e3 * rms:.2f} mm"
-            ),
-        )  # fmt: skip
-        fits.append((found, kind))
-    return min(fits, key=lambda fit: fit[0].rms)
+        try:
+            found = fit(
+                [motion], model=kind,
+                callback=lambda rms, task=task, kind=kind: progress.update(
+                    task, description=f"fitting, {kind}: {1e3 * rms:.2f} mm"
+                ),
+            )  # fmt: skip
+        except IdentificationFailed:
+            if not fits and kind == models[-1]:
+                raise
+        else:
+            fits.append((found, kind))
+    return min(fits, key=lambda pair: np.nan_to_num(pair[0].rms, nan=np.inf))
 
 
 def as_json(found: Identified) -> dict[str, Any]:
     """``found`` for identified.json; with what ``RodProperties`` takes."""
     p = found.properties
     return {
-        "rms_mm": 1e3 * found.rms,
+        "rms_mm": 1e3 * found.rms if np.isfinite(found.rms) else None,
         "parameters": {
             parameter.name: {
                 "value": found.values[parameter.name],
@@ -183,7 +195,6 @@ def summary(found: Identified, title: str) -> Table:
 
 def draw(file: Path, motion: CableMotion, found: Identified, model: Model) -> None:
     """Shapes seen and fitted, from the side and from above, and the distance over time."""
-    matplotlib.use("Agg")
     points = predict(motion, found.properties, model, derivatives=False).points
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     side, top, error = figure.subplots(1, 3)

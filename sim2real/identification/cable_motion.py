@@ -109,22 +109,37 @@ class CableMotion:
         return replace(self, **turned) if turned else self
 
     def windows(self, seconds: float) -> list["CableMotion"]:
-        """Its parts of about ``seconds`` [s] one after the other, as motions of their own."""
+        """Its parts of about ``seconds`` [s] one after the other, as motions of their own; each
+        begins with a ``clear`` sample."""
         duration = self.stamps[-1] - self.stamps[0]
         n_parts = max(1, min(round(duration / seconds), len(self) // 2))
-        edges = np.round(np.linspace(0, len(self), n_parts + 1)).astype(int)
+        edges = [0]
+        for cut in np.round(np.linspace(0, len(self), n_parts + 1)[1:-1]):
+            edge = next((sample for sample in self.clear if sample >= cut), len(self))
+            if edges[-1] + 2 <= edge <= len(self) - 2:
+                edges.append(edge)
         return [
             replace(
                 self, stamps=self.stamps[a:b], left=self.left[a:b],
                 right=None if self.right is None else self.right[a:b], points=self.points[a:b],
             )
-            for a, b in pairwise(edges)
+            for a, b in pairwise([*edges, len(self)])
         ]  # fmt: skip
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
         """(T, n_points)."""
         return ~np.isnan(self.points[..., 0])
+
+    @cached_property
+    def clear(self) -> list[int]:
+        """Samples of which two points or more were seen."""
+        return np.flatnonzero(np.count_nonzero(self.seen, axis=1) > 1).tolist()
+
+    @cached_property
+    def _inner(self) -> NDArray[np.bool_]:
+        """(n_points,) whether a point is in no clamp."""
+        return (self.places > 0.0) & ((self.places < 1.0) | (self.right is None))
 
     @cached_property
     def weights(self) -> Array:
@@ -152,7 +167,7 @@ class CableMotion:
     @cached_property
     def accelerations(self) -> Array:
         """(T, n_nodes, 3) of the rod's nodes [m/s^2], from parabolas over ``PARABOLA`` of time."""
-        inner = (self.places > 0.0) & (self.places < 1.0)
+        inner = self._inner
         tracks = [self.left[:, None, :3, 3], _filled(self.points[:, inner], self.seen[:, inner])]
         places = [[0.0], self.places[inner]]
         if self.right is not None:
@@ -171,11 +186,8 @@ class CableMotion:
     def curve(self, sample: int) -> Array:
         """(n_nodes, 3) of a smooth curve through both clamps and a sample's points [m]."""
         ends = [self.left[sample, :3, 3]], [] if self.right is None else [self.right[sample, :3, 3]]
-        inner = (self.places > 0.0) & ((self.places < 1.0) | (self.right is None))
-        through = np.concatenate(
-            [part for part in (ends[0], self.points[sample, self.seen[sample] & inner], ends[1])
-             if len(part)]
-        )  # fmt: skip
+        inner = self.points[sample, self.seen[sample] & self._inner]
+        through = np.concatenate([part for part in (ends[0], inner, ends[1]) if len(part)])
         return resample(through, self.n_elements + 1)
 
     def difference(self, predicted: Array) -> Array:

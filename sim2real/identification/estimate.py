@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from dlo_gym.exceptions import DloError
+from dlo_gym.exceptions import IdentificationFailed
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.properties import RodProperties
 from sim2real.identification.cable_motion import CableMotion
@@ -30,10 +30,6 @@ FIRST_SCALE = 0.02  # taken for it at first [m]
 SMALLEST_SCALE = 1e-7  # [m]
 MOST_TRIALS = 50  # in each
 CONFIDENCE = 1.96  # deviations, 95 %
-
-
-class IdentificationFailed(DloError):
-    """No rod could follow the motion."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +76,7 @@ class Identified:
         return tuple(name for name, ratio in self.told.items() if ratio > LEARNT)
 
 
-def identify(
+def fit(
     motions: Sequence[CableMotion],
     *,
     model: Model = "motion",
@@ -112,7 +108,7 @@ def identify(
         z = np.array([p.z(value) for p, value in zip(parameters, values, strict=True)])
     elif model == "motion":
         z = np.insert(
-            identify(motions, model="accelerated", callback=callback).z, N_REST, [0] * N_DAMPING
+            fit(motions, model="accelerated", callback=callback).z, N_REST, [0] * N_DAMPING
         )
     else:
         z = np.zeros(len(parameters))

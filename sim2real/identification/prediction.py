@@ -61,6 +61,7 @@ def at_rest(
 ) -> Prediction:
     """The equilibrium in every sample, each followed from the one before.
 
+    ``accelerated`` forces grow with the rod's length, which the derivative by it leaves out.
     The first starts from the curve that was seen, and so does one that cannot be followed.
     """
     rod = CosseratRod(properties, motion.n_elements, clamp=motion.clamp)
@@ -146,9 +147,9 @@ def start(rod: CosseratRod, motion: CableMotion) -> tuple[RodState, MotionSensit
     state = rod.settle(motion.boundary(0), curve)
     held = rod.motion_sensitivity(ROD, by_clamps=True)
     rod.attract(curve, 0.0)
-    later = max(1, int(np.searchsorted(motion.stamps - motion.stamps[0], LAUNCH)))
-    duration = float(motion.stamps[later] - motion.stamps[0])
-    velocities = (motion.curve(later) - curve) / duration
+    since = motion.stamps - motion.stamps[0]
+    later = next((s for s in motion.clear if since[s] >= LAUNCH), len(motion) - 1)
+    velocities = (motion.curve(later) - curve) / since[later]
     along = np.diff(state.positions, axis=0)
     turning = np.cross(along, np.diff(velocities, axis=0))
     turning /= (along**2).sum(axis=1, keepdims=True)

@@ -10,7 +10,7 @@ from sim2real.identification.cable_motion import CableMotion
 from sim2real.identification.parameters import Grip, Parameter, grips_of, rod_of, values_of
 from sim2real.identification.prediction import ROD, Model, Prediction, predict
 
-LOST = 0.3  # distance counted where the rod could not follow [m]
+LOST = 0.3  # counted along each axis where the rod could not follow [m]
 STEADY = 0.3  # [m per prior deviation]
 
 

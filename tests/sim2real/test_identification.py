@@ -5,13 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dlo_gym.exceptions import IdentificationFailed
 from dlo_gym.geometry.se3 import exp_so3
 from dlo_gym.rod.boundary import BoundaryPoses
 from dlo_gym.rod.initial_shapes import random_boundary
 from dlo_gym.rod.rod import CosseratRod
 from sim2real.identification.cable_motion import CableMotion
-from sim2real.identification.estimate import IdentificationFailed, identify
+from sim2real.identification.estimate import fit
 from sim2real.identification.parameters import prior, rod_of
+from sim2real.identification.prediction import predict
 from sim2real.identification.residuals import Residuals
 
 LENGTH, RADIUS, ELEMENTS = 0.5, 0.003, 20
@@ -57,7 +59,7 @@ def exact() -> list[CableMotion]:
 @pytest.mark.parametrize("factor", [0.25, 4.0])
 def test_equilibria_give_the_parameters_from_a_start_far_off(exact, factor):
     start = TRUTH * [factor, 1.0 / factor, 0.0, 0.0, 0.0, LENGTH / TRUTH[5]]
-    found = identify(exact, model="rest", start=start)
+    found = fit(exact, model="rest", start=start)
     assert found.rms < 1e-5
     assert not found.unidentified
     np.testing.assert_allclose(list(found.values.values()), TRUTH, rtol=2e-3, atol=2e-3)
@@ -65,9 +67,7 @@ def test_equilibria_give_the_parameters_from_a_start_far_off(exact, factor):
 
 @pytest.mark.parametrize("across", [False, True])
 def test_intervals_hold_the_truth_of_noisy_points(across):
-    found = identify(
-        [replace(at_rest(s, noise=1e-3), across=across) for s in range(2)], model="rest"
-    )
+    found = fit([replace(at_rest(s, noise=1e-3), across=across) for s in range(2)], model="rest")
     assert found.rms == pytest.approx(1e-3 * np.sqrt(2 if across else 3), rel=0.1)
     assert found.values["EI / weight"] == pytest.approx(TRUTH[0], rel=0.05)
     assert found.values["length"] == pytest.approx(TRUTH[5], rel=0.01)
@@ -83,7 +83,7 @@ def test_what_hangs_in_a_plane_tells_nothing_of_twist(exact):
     still = BoundaryPoses(left, right)
     straight = TRUTH * [1, 1, 0, 0, 0, 1]
     shape = CosseratRod(rod_of(straight, motion, "rest"), ELEMENTS).settle(still).positions
-    found = identify([
+    found = fit([
         replace(motion, left=np.tile(left, (len(motion), 1, 1)),
                 right=np.tile(right, (len(motion), 1, 1)), points=np.tile(shape, (12, 1, 1)))
     ], model="rest")  # fmt: skip
@@ -108,7 +108,7 @@ def test_a_cable_held_at_one_end_is_identified(exact):
     straight = TRUTH * [1, 1, 0, 0, 0, 1]
     rod = CosseratRod(rod_of(straight, motion, "rest"), ELEMENTS)
     points = np.array([rod.settle(motion.boundary(i)).positions for i in range(len(motion))])
-    found = identify([replace(motion, points=points)], model="rest")
+    found = fit([replace(motion, points=points)], model="rest")
     assert found.values["EI / weight"] == pytest.approx(TRUTH[0], rel=0.02)
     assert found.values["length"] == pytest.approx(TRUTH[5], rel=0.005)
 
@@ -117,7 +117,7 @@ def test_points_not_seen_do_not_count(exact):
     motion = exact[0]
     points = motion.points.copy()
     points[1:, ::2] = np.nan
-    found = identify([replace(motion, points=points), exact[1]], model="rest")
+    found = fit([replace(motion, points=points), exact[1]], model="rest")
     assert found.values["EI / weight"] == pytest.approx(TRUTH[0], rel=2e-3)
 
 
@@ -130,11 +130,31 @@ def test_bad_motions_are_refused(exact):
     with pytest.raises(ValueError, match="stamps: expected two increasing"):
         replace(motion, stamps=motion.stamps[::-1])
     with pytest.raises(ValueError, match="motions: expected at least one"):
-        identify([])
+        fit([])
     far = motion.right.copy()
     far[:, :3, 3] += 1.0
     with pytest.raises(IdentificationFailed):
-        identify([replace(motion, right=far)], model="rest")
+        fit([replace(motion, right=far)], model="rest")
+
+
+def test_windows_begin_where_two_points_were_seen(exact):
+    motion = exact[0]
+    for hidden, lengths in ((slice(0, 0), [4, 4, 4]), (slice(4, 6), [6, 2, 4]),
+                            (slice(4, 7), [7, 5]), (slice(7, 12), [4, 8])):  # fmt: skip
+        points = motion.points.copy()
+        points[hidden, 1:] = np.nan
+        parts = replace(motion, points=points).windows(2.0)
+        assert [len(part) for part in parts] == lengths
+        np.testing.assert_array_equal(np.concatenate([p.stamps for p in parts]), motion.stamps)
+        np.testing.assert_array_equal(np.concatenate([p.points for p in parts]), points)
+
+
+def test_a_free_end_has_the_acceleration_that_was_seen(exact):
+    points = exact[0].points.copy()
+    points[:, -1, 2] += 1.5 * exact[0].stamps ** 2
+    free = replace(exact[0], points=points, right=None)
+    change = free.accelerations - replace(exact[0], right=None).accelerations
+    np.testing.assert_allclose(change[:, -1], np.tile([0.0, 0.0, 3.0], (len(free), 1)), atol=1e-9)
 
 
 DYNAMIC = np.array([*TRUTH, 1.5, 0.02])
@@ -161,7 +181,7 @@ def swinging() -> list[CableMotion]:
 @pytest.mark.parametrize("factor", [0.25, 4.0])
 def test_motion_gives_the_parameters_from_a_start_far_off(swinging, factor):
     start = DYNAMIC * [factor, 1 / factor, 0, 0, 0, LENGTH / TRUTH[5], 1 / factor, factor]
-    found = identify(swinging, model="motion", start=start)
+    found = fit(swinging, model="motion", start=start)
     assert found.rms < 3e-4  # the first sample's velocity is not known exactly
     assert not found.unidentified
     values = list(found.values.values())
@@ -182,3 +202,30 @@ def test_the_jacobian_of_motion_is_that_of_the_residuals(swinging):
         # Stretch follows EI, which the Jacobian neglects.
         assert np.abs(exactly[:, column] - difference).max() < (1e-6 if column else 0.03) * largest
         assert np.abs(difference).max() > 1e-4
+
+
+def test_a_clip_shorter_than_the_launch_is_predicted(swinging):
+    motion = swinging[0]
+    short = replace(motion, stamps=0.1 * motion.stamps[:2], left=motion.left[:2],
+                    right=motion.right[:2], points=motion.points[:2])  # fmt: skip
+    points = predict(short, rod_of(DYNAMIC, short, "motion"), "motion").points
+    np.testing.assert_allclose(points, short.points, atol=3e-4)
+
+
+def test_the_first_velocity_is_not_taken_from_a_sample_that_nobody_saw(swinging):
+    points = swinging[0].points.copy()
+    points[1] = np.nan
+    motion = replace(swinging[0], points=points)
+    predicted = predict(motion, rod_of(DYNAMIC, motion, "motion"), "motion", derivatives=False)
+    assert motion.mean_distance(predicted.points) < 1e-3
+
+
+def test_the_jacobian_with_accelerations_leaves_out_that_forces_grow_with_length(swinging):
+    parameters = prior(swinging[0], "accelerated")
+    residuals = Residuals(swinging[:1], parameters, "accelerated")
+    z = np.array([p.z(value) for p, value in zip(parameters, TRUTH, strict=True)])
+    exactly = residuals.jacobian(z)
+    for column, step in enumerate(1e-4 * np.eye(len(z))):
+        difference = (residuals.vector(z + step) - residuals.vector(z - step)) / 2e-4
+        error = np.abs(exactly[:, column] - difference).max() / np.abs(difference).max()
+        assert error < {"EI / weight": 0.03, "length": 0.3}.get(parameters[column].name, 1e-6)

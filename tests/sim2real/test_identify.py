@@ -2,18 +2,24 @@
 
 import json
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from dlo_gym.cli import main
-from dlo_gym.geometry import CameraModel
-from dlo_gym.recording import RecordingWriter
+from dlo_gym.exceptions import IdentificationFailed
+from dlo_gym.geometry import CameraModel, View
+from dlo_gym.recording import Recording, RecordingWriter
 from dlo_gym.rod import RodProperties
 from dlo_gym.rod.rod import CosseratRod
+from sim2real import identify as command
+from sim2real.identification.estimate import fit
 from tests.tracking.drawing import LENGTH, RADIUS, clamps, draw_cable
 
 SAMPLES = 12
+PERIOD = 0.05  # [s]
+TIMES = PERIOD * np.arange(20)
 MODULUS, DENSITY = 1e6, 1e3
 STIFFNESS = MODULUS * RADIUS**2 / (4.0 * DENSITY * 9.81)  # EI / weight of a solid round rod [m^3]
 
@@ -41,6 +47,26 @@ def drawn(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def swung(tmp_path_factory):
+    """A recording of a rod whose clamps swing it; nobody looks."""
+    path = tmp_path_factory.mktemp("recordings") / "swung"
+    camera = CameraModel.looking_at("side", (0.05, -1.05, 0.42), (0, 0, 0.27)).scaled(0.02)
+    view = View(np.zeros((camera.height, camera.width, 3), np.uint8), camera, 0.0)
+    rod = CosseratRod(RodProperties(LENGTH, RADIUS, MODULUS, DENSITY), 20)
+    poses = [clamps(shift=(0, 0.05 * np.sin(4 * t), 0.05 * np.sin(4 * t) ** 2)) for t in TIMES]
+    state = rod.settle(poses[0])
+    with RecordingWriter(
+        path, [camera], rod_length=LENGTH, rod_radius=RADIUS, rate_hz=1.0 / PERIOD
+    ) as writer:
+        for i, pose in enumerate(poses):
+            if i:
+                step = poses[i - 1].displacement_to(pose)
+                state = rod.advance(step, PERIOD)
+            writer.append([view], pose.left, pose.right, TIMES[i], centerline=state.positions)
+    return path
+
+
 def run(*arguments) -> int:
     return main(["identify", *map(str, arguments)])
 
@@ -52,7 +78,7 @@ def parameters(folder) -> dict[str, float]:
 
 def test_the_truth_gives_stiffness_and_length(drawn, tmp_path):
     out = tmp_path / "out"
-    assert run(drawn / "with_truth", "--from", "truth", "--model", "rest", "--output", out) == 0
+    assert run(drawn / "with_truth", "--from", "truth", "--model", "rest", "--out", out) == 0
     found = parameters(out)
     assert found["EI / weight"] == pytest.approx(STIFFNESS, rel=0.01)
     assert found["length"] == pytest.approx(LENGTH, rel=0.001)
@@ -71,18 +97,70 @@ def test_the_truth_gives_stiffness_and_length(drawn, tmp_path):
 
 def test_the_tracker_gives_them_though_its_rod_is_too_soft(drawn, tmp_path):
     out = tmp_path / "out"
-    options = ("--model", "rest", "--youngs-modulus", "4e5", "--output", out)
+    options = ("--model", "rest", "--youngs-modulus", "4e5", "--out", out)
     assert run(drawn / "without", "--from", "estimate", *options) == 0
     found = parameters(out)
     assert found["EI / weight"] == pytest.approx(STIFFNESS, rel=0.1)
     assert found["length"] == pytest.approx(LENGTH, rel=0.03)
 
 
+def test_the_model_that_fits_better_is_kept(drawn, swung, tmp_path):
+    models = {}
+    for recording in (drawn / "with_truth", swung):
+        out = tmp_path / recording.name
+        assert run(recording, "--from", "truth", "--out", out) == 0
+        models[recording.name] = json.loads((out / "identified.json").read_text())["model"]
+        assert parameters(out)["EI / weight"] == pytest.approx(STIFFNESS, rel=0.02)
+    assert models == {"with_truth": "rest", "swung": "motion"}
+    assert {"external damping", "internal damping"} <= set(parameters(out))
+
+
+@pytest.fixture(scope="module")
+def found(swung):
+    return fit([command.motion_of_truth(Recording.load(swung))], model="rest")
+
+
+@pytest.mark.parametrize(
+    ("rest", "motion", "kept"),
+    [
+        (None, 1.0, "motion"),
+        (1.0, None, "rest"),
+        (np.nan, 1.0, "motion"),
+        (np.nan, None, "rest"),
+        (None, None, None),
+    ],
+)
+def test_a_model_that_fails_leaves_the_other(
+    swung, found, tmp_path, monkeypatch, capsys, rest, motion, kept
+):
+    def fit_with(motions, *, model, callback):
+        rms = {"rest": rest, "motion": motion}[model]
+        if rms is None:
+            raise IdentificationFailed(f"{model} could not follow")
+        return replace(found, rms=rms)
+
+    monkeypatch.setattr(command, "fit", fit_with)
+    status = run(swung, "--from", "truth", "--out", tmp_path / "out")
+    if kept is None:
+        assert status == 1
+        assert "could not follow" in capsys.readouterr().err
+        return
+    report = json.loads((tmp_path / "out" / "identified.json").read_text())
+    rms_mm = 1e3 if 1.0 in (rest, motion) else None
+    assert (report["model"], report["rms_mm"]) == (kept, rms_mm)
+
+
 def test_what_cannot_be_is_said(drawn, tmp_path, capsys):
-    assert run(drawn / "without", "--from", "truth", "--output", tmp_path / "out") == 1
+    assert run(drawn / "without", "--from", "truth", "--out", tmp_path / "out") == 1
     assert "has no truth.npz" in capsys.readouterr().err
-    assert run(drawn / "nothing", "--output", tmp_path / "out") == 1
+    with_truth = (drawn / "with_truth", "--from", "truth", "--out", tmp_path / "out")
+    assert run(*with_truth, "--youngs-modulus", "4e5") == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "youngs_modulus: expected none with --from truth" in said
+    assert run(drawn / "nothing", "--out", tmp_path / "out") == 1
+    said = "".join(capsys.readouterr().err.split())
+    assert f"{drawn / 'nothing' / 'recording.json'}:expectedthisfile" in said
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "precious.txt").write_text("")
-    assert run(drawn / "with_truth", "--output", tmp_path / "mine", "--overwrite") == 1
+    assert run(drawn / "with_truth", "--out", tmp_path / "mine", "--overwrite") == 1
     assert "precious.txt" in capsys.readouterr().err
