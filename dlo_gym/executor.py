@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from dlo_gym.exceptions import MissingExtra, WorkersLost
+from dlo_gym.threads import n_cores
 
 ATTEMPTS = 3  # at a task whose worker dies
 LOOPBACK = "127.0.0.1"
@@ -47,7 +48,7 @@ def run_tasks(
     """
     if workers < 0:
         raise ValueError(f"workers: expected 0 or more, got {workers}")
-    n_processes = workers or os.cpu_count() or 1
+    n_processes = workers or n_cores()
     if ray_address is not None:
         yield from _on_ray(function, tasks, ray_address, n_processes)
     elif n_processes == 1 or len(tasks) < 2:

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from dlo_gym.envs import tasks
 from dlo_gym.envs.shape_env import ShapeControlEnv, flat_observation, two_clamps
-from dlo_gym.envs.threads import Threads, n_cores
 from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryDisplacement
+from dlo_gym.threads import Threads, n_cores
 
 Observations = dict[str, NDArray]
 

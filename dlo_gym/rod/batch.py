@@ -1,8 +1,6 @@
 """Many rods that settle and move together, in threads."""
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
@@ -14,6 +12,7 @@ from dlo_gym.geometry.se3 import Array
 from dlo_gym.rod.boundary import BoundaryDisplacement, BoundaryPoses
 from dlo_gym.rod.rod import CosseratRod
 from dlo_gym.rod.state import RodState
+from dlo_gym.threads import Threads, n_cores
 
 Asked = TypeVar("Asked")
 
@@ -25,10 +24,12 @@ class BatchState:
     Attributes:
         states: (m,) of each rod; None of one that has never settled.
         errors: (m,) why a rod stayed where it was; None where it did as asked.
+        n_elements: of each rod.
     """
 
     states: tuple[RodState | None, ...]
     errors: tuple[RodDiverged | ValueError | None, ...]
+    n_elements: int
 
     @property
     def lost(self) -> NDArray[np.bool_]:
@@ -38,37 +39,36 @@ class BatchState:
     @property
     def positions(self) -> Array:
         """(m, n_nodes, 3) centerlines in world [m]; NaN without a state, as all that follows."""
-        return self._stacked(lambda state: state.positions)
+        return self._stacked(lambda state: state.positions, self.n_elements + 1, 3)
 
     @property
     def quaternions(self) -> Array:
         """(m, n_elements, 4) wxyz of R_world_element."""
-        return self._stacked(lambda state: state.quaternions)
+        return self._stacked(lambda state: state.quaternions, self.n_elements, 4)
 
     @property
     def curvature(self) -> Array:
         """(m, n_elements - 1, 3) curvature and twist at the inner nodes [1/m]."""
-        return self._stacked(lambda state: state.curvature)
+        return self._stacked(lambda state: state.curvature, self.n_elements - 1, 3)
 
     @property
     def strain(self) -> Array:
         """(m, n_elements, 3) shear and stretch [-]."""
-        return self._stacked(lambda state: state.strain)
+        return self._stacked(lambda state: state.strain, self.n_elements, 3)
 
     @property
     def wrenches(self) -> Array:
         """(m, 2, 6) force [N] and torque [N m], world axes, of left and right clamp on the rod."""
-        return self._stacked(lambda state: np.stack([state.wrench_left, state.wrench_right]))
+        return self._stacked(lambda state: np.stack([state.wrench_left, state.wrench_right]), 2, 6)
 
     @property
     def energy(self) -> Array:
         """(m,) elastic plus gravitational [J]."""
         return self._stacked(lambda state: np.asarray(state.energy))
 
-    def _stacked(self, part: Callable[[RodState], Array]) -> Array:
-        parts = [None if state is None else part(state) for state in self.states]
-        shape = next((np.shape(known) for known in parts if known is not None), ())
-        return np.stack([np.full(shape, np.nan) if known is None else known for known in parts])
+    def _stacked(self, part: Callable[[RodState], Array], *shape: int) -> Array:
+        unknown = np.full(shape, np.nan)
+        return np.stack([unknown if state is None else part(state) for state in self.states])
 
 
 class RodBatch:
@@ -80,8 +80,7 @@ class RodBatch:
 
     Args:
         rods: distinct rods of the same ``n_elements``.
-        threads: how many work at once; None takes ``OMP_NUM_THREADS`` where it is set, else the
-            number of this process's cores.
+        threads: how many work at once; None takes one per core that this process may use.
 
     Raises:
         ValueError: naming the argument.
@@ -95,11 +94,11 @@ class RodBatch:
         if len(sizes) > 1:
             raise ValueError(f"rods: expected one number of elements, got {sizes}")
         if threads is None:
-            threads = int(os.environ.get("OMP_NUM_THREADS") or os.cpu_count() or 1)
+            threads = n_cores()
         if threads < 1:
             raise ValueError(f"threads: expected at least 1, got {threads}")
         self.threads = min(threads, len(self.rods))
-        self._pool = ThreadPoolExecutor(self.threads, "rods") if self.threads > 1 else None
+        self._threads = Threads(self.threads)
 
     def __len__(self) -> int:
         return len(self.rods)
@@ -139,18 +138,11 @@ class RodBatch:
         """What ``action`` returns or raises for each rod and what is ``asked`` of it."""
         if len(asked) != len(self):
             raise ValueError(f"expected one per rod, {len(self)}, got {len(asked)}")
-        done: list[_Answer] = [_Answer(None, None)] * len(self)
-
-        def work(first: int) -> None:
-            for i in range(first, len(self), self.threads):
-                done[i] = _answer(action, self.rods[i], asked[i])
-
-        if self._pool is None:
-            work(0)
-        else:
-            list(self._pool.map(work, range(self.threads)))
+        done = self._threads.map(lambda rod, wanted: _answer(action, rod, wanted), self.rods, asked)
         return BatchState(
-            tuple(answer.state for answer in done), tuple(answer.error for answer in done)
+            tuple(answer.state for answer in done),
+            tuple(answer.error for answer in done),
+            self.rods[0].n_elements,
         )
 
 

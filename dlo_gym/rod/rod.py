@@ -123,10 +123,12 @@ class CosseratRod:
             )
         weight = node_weights(self.properties, self.n_elements, self.gravity)
         self._arrays = self._arrays._replace(forces=weight + forces)
-        self._system = self._system._replace(rod=self._arrays)
+        self._set_potential(self._system._replace(rod=self._arrays))
 
     def attract(self, targets: ArrayLike, stiffness: ArrayLike) -> None:
-        """Springs from the nodes to ``targets``, from the next ``settle`` on; zero ends them.
+        """Springs from the nodes to ``targets``, from the next solve on; zero ends them.
+
+        They are for ``settle`` and ``move``: ``advance`` refuses a rod that they pull.
 
         Args:
             targets: (n_nodes, 3) [m].
@@ -135,7 +137,7 @@ class CosseratRod:
         Raises:
             ValueError: on a wrong shape or a value that is not finite, or negative stiffness.
         """
-        self._system = System(self._arrays, springs_of(targets, stiffness, self.n_elements))
+        self._set_potential(System(self._arrays, springs_of(targets, stiffness, self.n_elements)))
 
     def settle(self, boundary: BoundaryPoses, start: ArrayLike | None = None) -> RodState:
         """Find the equilibrium between clamps from afar.
@@ -213,12 +215,11 @@ class CosseratRod:
             )
         self._boundary = target
         self._rotations[:] = self._clamps[:, :3, :3]
-        self._v, self._w = np.zeros((self.n_nodes, 3)), np.zeros((self.n_elements, 3))
-        self._spins = np.zeros((2, 3))
+        self._stand_still()
         return self.state
 
     def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        """Put other obstacles around the rod, which settles among them from where it is.
+        """Put other obstacles around the rod, which settles among them from where it is, at rest.
 
         ``move`` is for obstacles that move: it goes with them.
 
@@ -233,10 +234,12 @@ class CosseratRod:
         check_clamps(self._boundary, obstacles, self._contact.radii)
         former = self.state
         self._contact.replace(obstacles)
+        move_kernels.flow(self._held)
         problem, _ = self._go(np.zeros(12), descend=True)
         if problem:
             self.restore(former)
             raise RodDiverged(f"no equilibrium among the obstacles: {problem}", last_good=former)
+        self._stand_still()
 
     def advance(
         self,
@@ -262,8 +265,8 @@ class CosseratRod:
                 they stay.
 
         Raises:
-            ValueError: naming the argument; or if the rod has not settled, or the clamps would end
-                further apart than the rod is long or inside an obstacle.
+            ValueError: naming the argument; or if the rod has not settled, springs pull it, or the
+                clamps would end further apart than the rod is long or inside an obstacle.
             RodDiverged: if no step was small enough; the rod keeps its state before.
         """
         self._settled("advance")
@@ -344,9 +347,11 @@ class CosseratRod:
         self._settled("motion_sensitivity")
         self._check_smooth("motion_sensitivity")
         names = check_parameters(parameters)
+        if not equilibrium and by_clamps:
+            raise ValueError("by_clamps: expected False for what is no equilibrium, got True")
         if not equilibrium:
             return MotionSensitivity.zero(names, self.n_elements)
-        if self._v.any() or self._w.any():
+        if self._in_motion:
             raise ValueError("equilibrium: expected False for a rod in motion, got True")
         rest = at_rest(names, self._by_parameters())
         if not by_clamps:
@@ -378,6 +383,10 @@ class CosseratRod:
         carried: Carried | None = None,
     ) -> RodState:
         before = self._settled("advance")
+        if len(self._system.inertia.weight):
+            raise ValueError(
+                "advance: expected a rod without springs; attract(targets, 0) ends them"
+            )
         target = before.displaced(displacement)
         moved = None if obstacles is None else self._contact.check_same(obstacles)
         self._check_boundary(target, self._contact.obstacles if moved is None else moved)
@@ -471,8 +480,11 @@ class CosseratRod:
 
         Columns are translation [m] and rotation vector [rad] in world axes, of the left clamp, then
         of the right (zero where that end is free). From the factors of the last Newton step.
+
+        Raises:
+            ValueError: if the rod has not settled, or is in motion.
         """
-        self._settled("sensitivity")
+        self._check_at_rest("sensitivity")
         columns = np.empty((len(self._work.gradient), 12))
         if self._contact.possible:
             self._contact.sensitivity(self._work, self._rotations, self._ends.right_held, columns)
@@ -489,9 +501,9 @@ class CosseratRod:
         With contact the derivatives are those while the same points touch.
 
         Raises:
-            ValueError: if the rod has not settled.
+            ValueError: if the rod has not settled, or is in motion.
         """
-        self._settled("parameter_sensitivity")
+        self._check_at_rest("parameter_sensitivity")
         return self._of_nodes(self._by_parameters())
 
     def _of_nodes(self, columns: Array) -> Array:
@@ -504,9 +516,27 @@ class CosseratRod:
             raise ValueError(f"{action}: the rod has no state yet; call settle(boundary) first")
         return self._boundary
 
-    def _stop(self) -> None:
+    @property
+    def _in_motion(self) -> bool:
+        return bool(self._v.any() or self._w.any())
+
+    def _check_at_rest(self, action: str) -> None:
+        self._settled(action)
+        if self._in_motion:
+            raise ValueError(f"{action}: expected a rod at rest, got one in motion; move stops it")
+
+    def _set_potential(self, system: System) -> None:
+        """Exchange what acts on the rod; its shape stays until the next solve."""
+        self._system = system
+        if self.settled:
+            self._linearise()
+
+    def _stand_still(self) -> None:
         self._v, self._w = np.zeros((self.n_nodes, 3)), np.zeros((self.n_elements, 3))
         self._spins = np.zeros((2, 3))
+
+    def _stop(self) -> None:
+        self._stand_still()
         self._time = 0.0
         self._creep = np.zeros((self.n_nodes, 3))
         self._arrays.plastic[:] = 0.0

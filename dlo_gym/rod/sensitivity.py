@@ -92,11 +92,17 @@ class MotionSensitivity:
         """d(positions)/d(column), shape (n_nodes, 3).
 
         Raises:
-            ValueError: if there is no such column.
+            ValueError: if there is no such column, or more than one: ``positions`` has them all.
         """
-        if column not in self.columns:
+        places = [place for place, name in enumerate(self.columns) if name == column]
+        if not places:
             raise ValueError(f"column: expected one of {self.columns}, got {column!r}")
-        return self.positions[:, :, self.columns.index(column)]
+        if len(places) > 1:
+            raise ValueError(
+                f"column: expected a name that comes once, got {column!r};"
+                f" take positions[:, :, k] with k one of {places}"
+            )
+        return self.positions[:, :, places[0]]
 
 
 def check_parameters(parameters: Sequence[str]) -> tuple[str, ...]:

@@ -1,7 +1,6 @@
 """What the simulated world behind two emulated controllers is made of."""
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from math import isfinite
@@ -16,6 +15,7 @@ from dlo_gym.rod.properties import RodProperties
 from dlo_gym.scene.arms import SIDES, DualArm
 from dlo_gym.scene.board import BoardPlate
 from dlo_gym.scene.builder import SceneConfig, default_cameras
+from dlo_gym.threads import n_cores
 from sim2real.calibration.board import BoardSpec
 from sim2real.calibration.plan import nominal_mount
 from sim2real.config import CellConfig
@@ -70,7 +70,7 @@ class WorldConfig:
     address: str = DEFAULT_ADDRESS
     port: int = DEFAULT_PORT
     rate: float = 20.0
-    drawing_share: float = field(default_factory=lambda: min(0.2 * _n_cores(), 1.0))
+    drawing_share: float = field(default_factory=lambda: min(0.2 * n_cores(), 1.0))
     latency: Mapping[str, float] = field(default_factory=dict)
     clutter: Literal["none", "industrial"] = "none"
     n_distractor_cables: int = 0
@@ -249,7 +249,3 @@ def check_seconds(value: Any, name: str, largest: float = LARGEST_LATENCY) -> fl
     if not number or not 0.0 <= value <= largest:
         raise ValueError(f"{name}: expected 0 to {largest:g} s, got {value!r}")
     return float(value)
-
-
-def _n_cores() -> int:
-    return len(os.sched_getaffinity(0))

@@ -42,6 +42,12 @@ def test_every_task_is_done_once_and_named_by_its_index(workers):
     assert (processes == {os.getpid()}) == (workers == 1)
 
 
+def test_a_process_that_may_use_one_core_starts_no_other(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {1}, raising=False)
+    processes = {process for _, (_, process) in run_tasks(squared, [(1,), (2,)])}
+    assert processes == {os.getpid()}
+
+
 def test_results_in_the_order_of_their_tasks():
     came = iter([(2, "c"), (0, "a"), (1, "b"), (4, "e"), (3, "d")])
     ordered = in_order(came)

@@ -27,6 +27,22 @@ def test_springs_balance_the_forces_that_would_hold_the_nodes(rod):
     np.testing.assert_allclose(rod.settle(boundary, rest).positions, rest, atol=1e-7)
 
 
+def test_springs_count_at_once(rod):
+    state = rod.settle(random_boundary(np.random.default_rng(0), 0.5))
+    rod.attract(state.positions + np.array([0.0, 0.0, 0.01]), 50.0)
+    stored = 21 * 0.5 * 50.0 * 0.01**2
+    assert rod.state.energy - state.energy == pytest.approx(stored, abs=1e-12)
+
+
+def test_a_rod_that_springs_pull_does_not_advance(rod):
+    state = rod.settle(random_boundary(np.random.default_rng(0), 0.5))
+    rod.attract(state.positions, 50.0)
+    with pytest.raises(ValueError, match=r"advance: .*springs.* attract"):
+        rod.advance(BoundaryDisplacement.zero(), 0.1)
+    rod.attract(state.positions, 0.0)
+    rod.advance(BoundaryDisplacement.zero(), 0.1)
+
+
 def test_bad_springs_are_refused(rod):
     with pytest.raises(ValueError, match="targets: expected finite"):
         rod.attract(np.zeros((3, 3)), 1.0)

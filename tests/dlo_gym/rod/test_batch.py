@@ -1,3 +1,5 @@
+import os
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -94,6 +96,15 @@ def test_a_rod_that_never_settled_is_nan():
     assert "call settle" in str(again.errors[1])
 
 
+def test_shapes_are_the_same_where_no_rod_ever_settled():
+    batch = RodBatch(rods(), threads=1)
+    nowhere, settled = batch.state, batch.settle(boundaries())
+    assert nowhere.lost.all()
+    for name in ("positions", "quaternions", "curvature", "strain", "wrenches", "energy"):
+        assert getattr(nowhere, name).shape == getattr(settled, name).shape
+        assert np.isnan(getattr(nowhere, name)).all()
+
+
 def test_wrong_arguments_are_named():
     with pytest.raises(ValueError, match="rods: expected distinct"):
         RodBatch([])
@@ -108,7 +119,25 @@ def test_wrong_arguments_are_named():
         batch.move(np.zeros((5, 7)))
 
 
-def test_threads_follow_the_environment(monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+def test_a_thread_per_core_that_the_process_may_use(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "4,2")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 2, 5}, raising=False)
     assert RodBatch(rods()).threads == 3
     assert RodBatch(rods(), threads=2).threads == 2
+
+
+def test_no_rod_moves_any_more_when_one_ends_the_batch(monkeypatch):
+    batch, moving = RodBatch(rods(), threads=2), []
+    batch.settle(boundaries())
+
+    def move(rod, _):
+        if rod is batch.rods[0]:
+            raise MemoryError
+        moving.append(rod)
+        time.sleep(0.3)
+        moving.remove(rod)
+
+    monkeypatch.setattr(CosseratRod, "move", move)
+    with pytest.raises(MemoryError):
+        batch.move(np.zeros((len(batch), 12)))
+    assert not moving

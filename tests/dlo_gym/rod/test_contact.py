@@ -146,6 +146,20 @@ def test_settling_from_inside_an_obstacle_pushes_the_rod_out():
     assert state.contact.gaps.min() > -0.01 * RADIUS
 
 
+def test_a_rod_in_motion_rests_among_other_obstacles():
+    rod = bridge([], 0.3)
+    swing = np.array([0.02, 0.0, 0.0, 0.0, 0.2, 0.0])
+    rod.advance(BoundaryDisplacement(swing, swing), 0.1)
+    assert np.abs(rod.state.velocities).max() > 0.1
+    rod.set_obstacles([Plane()])
+    state = rod.state
+    for still in (state.velocities, state.angular_velocities, state.memory.clamp_spins):
+        assert not still.any()
+    np.testing.assert_allclose(
+        rod.move(BoundaryDisplacement.zero()).positions, state.positions, atol=1e-9
+    )
+
+
 def test_pushing_obstacle_takes_the_rod_along():
     rod = lying()
     pusher = Sphere.at([0.4, 0.03, 0.01], 0.01)

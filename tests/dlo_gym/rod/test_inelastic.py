@@ -71,6 +71,22 @@ def test_cantilever_keeps_the_closed_form_deflection():
     assert abs(state.positions[-1, 2] / exact - 1.0) < 5e-3
 
 
+def test_other_obstacles_leave_what_the_last_move_bent():
+    properties = RodProperties(LENGTH, yield_curvature=0.02, hardening=0.2)
+    rod = CosseratRod(properties, 20, gravity=WEIGHTLESS, clamp="node")
+    rod.settle(BoundaryPoses(HORIZONTAL))
+    forces = np.zeros((21, 3))
+    forces[-1, 2] = 1.5 * properties.bending_stiffness * 0.02 / LENGTH
+    rod.apply_forces(forces)
+    loaded = rod.move(STILL)
+    rod.apply_forces(0.0 * forces)
+    sprung_back = rod.move(STILL).positions
+    assert sprung_back[-1, 2] > 1e-4
+    rod.restore(loaded)
+    rod.set_obstacles([])
+    np.testing.assert_allclose(rod.state.positions, sprung_back, atol=1e-8)
+
+
 def test_plastic_cycles_dissipate():
     properties = RodProperties(LENGTH, yield_curvature=3.0, hardening=0.1)
     rod = CosseratRod(properties, 30, gravity=WEIGHTLESS, clamp="node")

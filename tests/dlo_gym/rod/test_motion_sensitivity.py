@@ -274,6 +274,24 @@ def test_bad_arguments_are_named():
         replace(MotionSensitivity.zero(("log_EI",), N), clamps=np.zeros((6, 1)))
     with pytest.raises(ValueError, match="column: expected one of"):
         rod.motion_sensitivity().of("density")
+    with pytest.raises(ValueError, match="by_clamps: expected False"):
+        rod.motion_sensitivity(equilibrium=False, by_clamps=True)
     rod.advance(fast_moves("both")[0], 0.1)
     with pytest.raises(ValueError, match="equilibrium: expected False"):
         rod.motion_sensitivity()
+    for formula in (rod.sensitivity, rod.parameter_sensitivity):
+        with pytest.raises(ValueError, match=f"{formula.__name__}: expected a rod at rest"):
+            formula()
+    rod.move(BoundaryDisplacement.zero())
+    assert np.isfinite(rod.sensitivity()).all()
+
+
+def test_of_two_columns_of_one_name_none_is_taken():
+    rod, moves = CosseratRod(PROPERTIES, N), fast_moves("left")
+    rod.settle(clamps("left"))
+    sensitivity = rod.motion_sensitivity(("log_EI",))
+    for move in moves[:2]:
+        _, sensitivity = rod.advance_with_sensitivity(sensitivity, move, 0.1, by_displacement=True)
+    with pytest.raises(ValueError, match=r"once, got 'left_dx'.*one of \[1, 7\]"):
+        sensitivity.of("left_dx")
+    np.testing.assert_array_equal(sensitivity.of("log_EI"), sensitivity.positions[:, :, 0])

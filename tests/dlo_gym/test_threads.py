@@ -1,14 +1,20 @@
 """Calls spread over threads."""
 
+import os
 import threading
+import time
 
 import pytest
 
-from dlo_gym.envs.threads import Threads, n_cores
+from dlo_gym.threads import Threads, n_cores
 
 
-def test_there_is_a_core():
-    assert n_cores() >= 1
+def test_cores_are_those_that_this_process_may_use(monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {1, 4, 5}, raising=False)
+    assert n_cores() == 3
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert n_cores() == 64
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
@@ -42,4 +48,22 @@ def test_what_a_call_raises_is_raised_when_no_call_runs_any_more(n):
         threads.map(call, range(8))
     assert not running
     assert threads.map(abs, [-1, -2]) == [1, 2]
+    threads.close()
+
+
+@pytest.mark.parametrize("error", [KeyError, KeyboardInterrupt])
+def test_once_a_call_has_raised_none_begins(error):
+    threads, begun, meeting = Threads(2), [], threading.Barrier(2)
+
+    def call(i):
+        begun.append(i)
+        if i < 2:
+            meeting.wait(timeout=10.0)
+        if threading.current_thread() is threading.main_thread():
+            raise error
+        time.sleep(0.3)
+
+    with pytest.raises(error):
+        threads.map(call, range(20))
+    assert sorted(begun) == [0, 1]
     threads.close()

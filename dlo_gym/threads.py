@@ -1,8 +1,8 @@
-"""Independent work on many environments in the threads of one process."""
+"""Independent work in the threads of one process."""
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 
@@ -19,32 +19,36 @@ class Threads:
 
     def __init__(self, n: int) -> None:
         self._n = n
-        self._pool = ThreadPoolExecutor(n - 1, "environments") if n > 1 else None
+        self._pool = ThreadPoolExecutor(n - 1, "dlo_gym") if n > 1 else None
 
     def map(self, function: Callable[..., Any], *arguments: Sequence[Any]) -> list[Any]:
-        """``list(map(function, *arguments))``, in an order of its own.
+        """``list(map(function, *arguments))``: results are in order, the calls in any.
 
-        Of what the calls raise, one exception is raised again once all threads have come to an end.
+        Once a call has raised, or Ctrl-C was pressed, no further one begins; one of what they raise
+        is raised when none runs any more.
         """
         calls = list(zip(*arguments, strict=True))
         if self._pool is None or len(calls) < 2:
             return [function(*call) for call in calls]
         results: list[Any] = [None] * len(calls)
-
         indices = iter(range(len(calls)))  # a thread that is done with one call takes the next
 
         def work() -> None:
-            for i in indices:
-                results[i] = function(*calls[i])
+            try:
+                for i in indices:
+                    results[i] = function(*calls[i])
+            except BaseException:
+                list(indices)  # leaves none to the other threads
+                raise
 
         others = [self._pool.submit(work) for _ in range(min(self._n, len(calls)) - 1)]
         try:
             work()
+            wait(others)
         finally:
-            problems = [other.exception() for other in others]
-        for problem in problems:
-            if problem is not None:
-                raise problem
+            wait(others)  # after Ctrl-C too
+        for other in others:
+            other.result()
         return results
 
     def close(self) -> None:
