@@ -262,12 +262,6 @@ class SimulatedCell:
         self._past.clear()
         self._show(0.0)
 
-    def arms_in_collision(self) -> bool:
-        """Whether an arm or gripper touches the other arm, itself, the table or an obstacle."""
-        if self.arms is None or self.joint_angles is None:
-            return False
-        return self.arms.clearance(self.joint_angles).minimum < 0.0 or self.arms_at_obstacle()
-
     def arms_at_obstacle(self) -> bool:
         """Whether an arm or gripper touches an obstacle."""
         if self.arms is None or self.joint_angles is None or not self.obstacles:

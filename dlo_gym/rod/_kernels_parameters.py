@@ -12,7 +12,7 @@ from math import sqrt
 import numpy as np
 from numba import njit
 
-from dlo_gym.rod._kernels_energy import plastic_flow
+from dlo_gym.rod._kernels_bending import plastic_flow
 
 LOG_EI, LOG_GJ, LOG_WEIGHT, REST_CURVATURE, LENGTH = 0, 1, 2, 3, 6  # three rest curvatures
 EXTERNAL_DAMPING, INTERNAL_DAMPING = 7, 8

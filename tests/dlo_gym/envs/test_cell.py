@@ -73,7 +73,7 @@ def test_without_arms_the_clamps_float_freely():
     cell.reset(APART)
     cell.move(BoundaryDisplacement.from_vector([0, 0, 2.0, 0, 0, 0, 0, 0, 2.0, 0, 0, 0]))
     assert cell.joint_angles is None
-    assert not cell.arms_in_collision()
+    assert not cell.arms_at_obstacle()
 
 
 def test_an_occluder_swings_about_its_centre():

@@ -114,7 +114,8 @@ def test_starts_lie_across_the_bar():
         np.testing.assert_allclose(observation["desired_goal"], [tau, 1.0], rtol=1e-6)
         assert env.observation_space.contains(observation)
         assert env.cell.stamp == 0.0
-        assert not env.cell.arms_in_collision()
+        assert env.cell.arms.clearance(env.cell.joint_angles).minimum > 0.0
+        assert not env.cell.arms_at_obstacle()
 
 
 def test_a_negative_winding_starts_under_the_bar():

@@ -17,6 +17,7 @@ from dlo_gym.rod import (
 )
 from dlo_gym.rod.initial_shapes import random_boundary
 from dlo_gym.rod.sensitivity import DISPLACEMENT, MOTION_PARAMETERS
+from tests.dlo_gym.rod.changed_properties import changed
 
 N = 12
 PROPERTIES = RodProperties(
@@ -26,20 +27,8 @@ PROPERTIES = RodProperties(
     external_damping=2.0,
     internal_damping=0.01,
 )
-REST = ("rest_curvature_1", "rest_curvature_2", "rest_twist")
+
 STEPS = {"length": 1e-5, "internal_damping": 1e-6, "external_damping": 1e-3}  # else 1e-4
-
-
-def changed(p: RodProperties, name: str, step: float) -> RodProperties:
-    if name == "log_EI":
-        return replace(p, EI=p.bending_stiffness * np.exp(step))
-    if name == "log_GJ":
-        return replace(p, GJ=p.twisting_stiffness * np.exp(step))
-    if name == "log_weight":
-        return replace(p, mass_per_length=p.linear_density * np.exp(step))
-    if name in REST:
-        return replace(p, rest_curvature=p.rest_curvature + step * np.eye(3)[REST.index(name)])
-    return replace(p, **{name: getattr(p, name) + step})
 
 
 def clamps(held: str, seed: int = 6) -> BoundaryPoses:

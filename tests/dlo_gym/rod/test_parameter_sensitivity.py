@@ -9,21 +9,9 @@ from dlo_gym.geometry.se3 import frame_along, pose
 from dlo_gym.rod import BoundaryDisplacement, BoundaryPoses, Capsule, CosseratRod, RodProperties
 from dlo_gym.rod.initial_shapes import random_boundary
 from dlo_gym.rod.sensitivity import PARAMETERS
+from tests.dlo_gym.rod.changed_properties import changed
 
 PROPERTIES = RodProperties(0.5, youngs_modulus=3e6, rest_curvature=(0.5, -0.3, 0.2))
-REST = ("rest_curvature_1", "rest_curvature_2", "rest_twist")
-
-
-def changed(p: RodProperties, name: str, step: float) -> RodProperties:
-    if name == "log_EI":
-        return replace(p, EI=p.bending_stiffness * np.exp(step))
-    if name == "log_GJ":
-        return replace(p, GJ=p.twisting_stiffness * np.exp(step))
-    if name == "log_weight":
-        return replace(p, mass_per_length=p.linear_density * np.exp(step))
-    if name in REST:
-        return replace(p, rest_curvature=p.rest_curvature + step * np.eye(3)[REST.index(name)])
-    return replace(p, **{name: getattr(p, name) + step})
 
 
 def compare(sensitivity, positions_of, properties, step, tolerance):
